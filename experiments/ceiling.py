@@ -32,7 +32,7 @@ from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import best, load_weights, save_weights, weights_tree
 from hector_jax.core.console import bar, exit_code
 from hector_jax.core.files import make_folder
-from hector_jax.core.inputs import InputError, require_package
+from hector_jax.core.inputs import InputError, plural, require_package
 from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, Range, check
 from hector_jax.core.trajectory import SOLVED
@@ -177,19 +177,20 @@ def main() -> None:
         for name in sets:
             each = [
                 metrics.make_verdict(
-                    config.loss, seeds[part], {n: of[n][part] for n in ("nominal", name)}
+                    config.loss, seeds[part], {traj: {n: of[n][part] for n in ("nominal", name)}}
                 )
-                for of in scores.values()
+                for traj, of in scores.items()
             ]
             changes = [metrics.compare(v, name, "nominal").change["L"].text() for v in each]
             falls = sum(int(v.scores[name].fallen.sum()) for v in each)
             rows.append([title, name, *changes, str(falls)])
-            numbers[f"{title} {name}"] = [v.scores[name].L.tolist() for v in each]
+            numbers[f"{title} {name}"] = [v.scores[name].L[:, 0].tolist() for v in each]
     walks = flags.generations * flags.population * len(campaign.cases)
     text = (
         f"{walks} walks, engine {engine.title}, on plants {first} to {first + count - 1} of "
         f"hfs-varied; `others` are {first + count} to {first + 2 * count - 1}. Change of L against "
-        "nominal in %, median over the plants with its 95 % interval, walked in MuJoCo C."
+        "nominal in %, median over the plants with its 95 % interval, walked in MuJoCo C; falls of "
+        f"{plural(count * len(commands), 'walk')}."
     )
     table = markdown_table(["plants", "set", *commands, "falls"], rows)
     path, title = folder / "report.md", "A search over many plants"

@@ -274,7 +274,11 @@ Losses = dict[Entry, dict[int, list[float]]]
 
 
 class Lead(NamedTuple):
-    """Ratio of the losses of an entry to those of its best rival, with its 95 % interval."""
+    """Ratio of the losses of an entry to those of its best rival, with its 95 % interval.
+
+    The interval is Student's, over pairs of repeats: the chance is that of the methods. Plants are
+    the same in all repeats, so it tells nothing of others.
+    """
 
     rival: Entry
     ratio: float
@@ -438,7 +442,8 @@ def report(
             text += [title, _losses_table(flags, on_others, {}, traj)]
         for title, losses in (("the plant of the walks", on_own), ("the other plants", on_others)):
             if any(entry.method not in OURS for entry in losses):
-                text += [f"L against the best rival on {title}:", _leads_table(flags, losses)]
+                about = f"L against the best rival on {title} [95 % interval over the repeats]:"
+                text += [about, _leads_table(flags, losses)]
         numbers[traj] = {
             f"{entry.start} {entry.method}": {
                 "own": each,

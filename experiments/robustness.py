@@ -202,7 +202,7 @@ def report(
         f"L / {BASELINE} is the median of the ratio in the same scene on the same plant, falls "
         "charged as the loss charges them; in brackets its 95 % interval from redrawing the "
         f"plants, rough where they are few ({flags.seeds} here). A star marks a ratio that is no "
-        "comparison, because one of the two falls more often by 2 of 32 or more.",
+        "comparison, because one of the two falls more often by 2 of 32 walks or the same share.",
     ]
     named = ("world", "seeds", "first_seed", "scenes")
     numbers = {

@@ -62,6 +62,7 @@ class Cell(NamedTuple):
     survived: Interval  # share of the walks without a fall
     ratio: Interval  # median of L / L of the baseline
     falls: int
+    falls_by_plant: tuple[int, ...]
     walks: int
     counts: bool  # the falls of both sets allow a comparison, see metrics
 
@@ -141,6 +142,7 @@ def evaluate_level(scores: Score, baseline: Score) -> Cell:
         survived=bootstrap(partial(np.mean, axis=(-2, -1)), ~scores.fallen),
         ratio=bootstrap(partial(np.median, axis=(-2, -1)), scores.L / baseline.L),
         falls=int(scores.fallen.sum()),
+        falls_by_plant=tuple(scores.fallen.sum(axis=1).tolist()),
         walks=scores.fallen.size,
         counts=falls_comparable(scores.fallen, baseline.fallen),
     )

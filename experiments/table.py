@@ -200,7 +200,7 @@ def _make_table(
             for key, weights in sets.items():
                 save_weights(out / "weights" / key / f"{name}.json", weights)
     by_trajectory = {
-        name: metrics.make_verdict(config.loss, flags.plants, scored.scores)
+        name: metrics.make_verdict(config.loss, flags.plants, {name: scored.scores})
         for name, scored in walks.items()
     }
     commits = {tuned.commit for by_set in tunings.values() for tuned in by_set.values()}

@@ -94,7 +94,7 @@ class Earlier(NamedTuple):
 class Table(NamedTuple):
     """Contents of the four files."""
 
-    verdicts: Mapping[str, Verdict]  # by trajectory
+    verdicts: Mapping[str, Verdict]  # by trajectory, of one scene each
     falls: Sequence[Fall]
     tunings: Mapping[str, Mapping[str, Tuning]]  # by trajectory and set
     searches: Mapping[str, Search]  # by trajectory
@@ -140,7 +140,7 @@ def summaries(verdicts: Mapping[str, Verdict]) -> dict[tuple[str, str], Summary]
 
 
 def ranking(verdict: Verdict) -> list[str]:
-    """Sort the sets from best to worst, by the median over seeds of L against nominal."""
+    """Sort the sets from best to worst, by the median of L against nominal."""
     base = verdict.scores["nominal"].L
     return sorted(verdict.scores, key=lambda name: float(np.median(verdict.scores[name].L / base)))
 
@@ -275,8 +275,8 @@ def _result(table: Table, sets: Summaries) -> dict[str, Any]:
     for trajectory, verdict in table.verdicts.items():
         result: dict[str, Any] = {**metrics.as_result(verdict), "family": table.family}
         for name, score in verdict.scores.items():
-            by_seed = {part: losses.tolist() for part, losses in score.losses.items()}
-            by_seed["fallen"] = score.fallen.astype(bool).tolist()
+            by_seed = {part: losses[:, 0].tolist() for part, losses in score.losses.items()}
+            by_seed["fallen"] = score.fallen[:, 0].astype(bool).tolist()
             result["sets"][name]["standin"]["by_seed"] = by_seed
         result["against"] = {
             f"{name} against {other}": metrics.change_result(comparison)

@@ -6,8 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from hector_jax.control.weights import nominal
 from hector_jax.core.trajectory import State, Trajectory, Wrench
-from hector_jax.core.tree import stack
-from hector_jax.runs.metrics import Score, Verdict
+from hector_jax.runs.metrics import Score, make_verdict
 from hector_jax.tuning.difftune import Iteration
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import PAPER_LOSS, total
@@ -107,19 +106,21 @@ def pretend_score(loss, fallen=False):
     )
 
 
-def pretend_verdict(seeds=8, fallen=()):
-    """A verdict over all sets; `fallen` names pairs (set, seed index) that fell."""
+def pretend_verdict(seeds=8, fallen=(), scenes=("straight",)):
+    """A verdict over all sets; `fallen` names pairs (set, seed index) that fell in every scene."""
     plant = np.exp(0.3 * np.random.default_rng(0).normal(size=seeds))
     level = dict(zip(SETS, (3.2e6, 2.9e6, 3.0e6, 1.9e6, 2.6e6, 1.2e6), strict=True))
-    noise = np.random.default_rng(1).normal(size=(len(SETS), seeds))
     scores = {}
-    for name, row in zip(SETS, noise, strict=True):
-        rows = [
-            pretend_score(level[name] * plant[i] * np.exp(0.05 * row[i]), (name, i) in fallen)
-            for i in range(seeds)
-        ]
-        scores[name] = stack(rows)
-    return Verdict(np.arange(seeds), scores, PAPER_LOSS)
+    for number, scene in enumerate(scenes, 1):
+        noise = np.random.default_rng(number).normal(size=(len(SETS), seeds))
+        scores[scene] = {
+            name: [
+                pretend_score(level[name] * plant[i] * np.exp(0.05 * row[i]), (name, i) in fallen)
+                for i in range(seeds)
+            ]
+            for name, row in zip(SETS, noise, strict=True)
+        }
+    return make_verdict(PAPER_LOSS, range(seeds), scores)
 
 
 def pretend_history(iterations=30, pace=5.0, refused=(), **others):

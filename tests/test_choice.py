@@ -172,3 +172,23 @@ def test_after_walks_the_earliest_set_as_good_as_the_best_is_taken(
         f"best: {chosen}, the earliest as good as set 2 on 8 other plants"
         in capsys.readouterr().err
     )
+
+
+def test_the_standard_error_of_that_choice_is_one_over_plants(monkeypatch):
+    """Copies of a command are no further sample: log L differs by 0.6 standard errors."""
+    excess = 0.1 * (-1.0) ** np.arange(choice.HELD_OUT)
+    excess += 0.6 * excess.std(ddof=1) / np.sqrt(choice.HELD_OUT)
+
+    def judge(*inputs, **notes):
+        del inputs, notes
+        losses, score = {"set 0": np.exp(-excess), "set 1": np.exp(-2 * excess)}, score_like()
+        return SimpleNamespace(
+            scores={
+                name: [score._replace(losses={"L": x}) for x in L] for name, L in losses.items()
+            }
+        )
+
+    monkeypatch.setattr(verdicts, "judge", judge)
+    sets, setup = dict.fromkeys(("set 0", "set 1"), nominal()), Setup(Executor(), CONFIG, ROBOT)
+    for count in (1, 4):
+        assert choice.earliest(setup, sets, (named_command("s"),) * count) == "set 0"

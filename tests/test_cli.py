@@ -369,6 +369,7 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     for name in names:
         standin = result["sets"][name]["standin"]
         assert standin["seeds"] == [0, 1]
+        assert standin["scenes"] == ["straight"]
         assert standin["falls"] == 0
         for part in ("L", "L_Eul", "L_pos", "L_ctrl"):
             assert standin[part]["mean"] > 0.0
@@ -403,6 +404,8 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     means = [each[name]["sets"]["with"]["standin"]["L"]["mean"] for name in each]
     assert result["sets"]["with"]["standin"]["L"]["mean"] == pytest.approx(np.mean(means))
     assert result["sets"]["with"]["hfs"]["L"]["mean"] > 0.0
+    for world in result["sets"]["with"].values():
+        assert (world["seeds"], world["scenes"]) == ([0], ["straight", "c"])
     lines = [json.loads(line) for line in Path("both/metrics.jsonl").read_text().splitlines()]
     at_start = dict(
         zip(weight_names(), weights_to_vector(load_weights(start)).tolist(), strict=True)

@@ -21,7 +21,8 @@ def change(median, counts=True):
 
 def verdict(L, falls=0, **changes):
     part = {"mean": L, "low": 0.9 * L, "high": 1.1 * L}
-    return {"L": part, "L_ctrl": part, "falls": falls, "seeds": [0, 1], "change": changes}
+    found = {"L": part, "L_ctrl": part, "falls": falls, "seeds": [0, 1], "scenes": ["c", "s"]}
+    return found | {"change": changes}
 
 
 def line(name, iteration, accepted=True, L=1e6):
@@ -78,7 +79,7 @@ def test_a_comparison_tells_losses_falls_iterations_and_what_differs(runs):
     one, two = told["runs"]
     assert (one["run"], one["seconds"], two["seconds"]) == (str(runs[0]), 150.0, None)
     assert one["sets"]["with"]["change"]["expert"]["median"] == -33.3
-    assert (one["sets"]["with"]["falls"], one["sets"]["with"]["seeds"]) == (1, 2)
+    assert [one["sets"]["with"][key] for key in ("falls", "seeds", "walks")] == [1, 2, 4]
     assert one["tuning"] == {"with": {"iterations": 2, "refused": 1}}
     assert told["differ"] == {
         "settings": {"flags.traj": ["straight", "c"], "flags.seeds": [8, 32]},
@@ -86,6 +87,15 @@ def test_a_comparison_tells_losses_falls_iterations_and_what_differs(runs):
     }
     same = compare_runs([load_run(runs[0])] * 2)
     assert same["differ"] == {"settings": {}, "versions": {}}
+
+
+def test_falls_of_a_result_that_does_not_name_its_trajectories_are_of_its_seeds(runs):
+    result = json.loads((runs[0] / "result.json").read_text())
+    for each in result["sets"].values():
+        del each["standin"]["scenes"]
+    (runs[0] / "result.json").write_text(json.dumps(result))
+    (old,) = compare_runs([load_run(runs[0])])["runs"]
+    assert [old["sets"]["with"][key] for key in ("falls", "seeds", "walks")] == [1, 2, 2]
 
 
 def test_the_table_has_a_column_for_each_run(runs):
@@ -100,6 +110,7 @@ def test_the_table_has_a_column_for_each_run(runs):
     assert "-33 [-36, -30]*" in text  # void
     assert rows["settings: flags.seeds"] == ["8", "32"]
     assert rows["time [s]"] == ["150", "-"]
+    assert "1 of 4" in text
     assert rows["with: iterations (refused)"] == ["2", "(1)", "2", "(1)"]
 
 

@@ -221,7 +221,7 @@ def test_an_evaluation_has_the_fall_before_t_0_and_tells_it_once_a_set(
 
 def test_the_table_of_a_set_that_always_falls_at_once_has_no_nan():
     scores = [metrics.score(PAPER_LOSS, fallen_at_once())] * 2
-    verdict = metrics.make_verdict(PAPER_LOSS, [0, 1], {"nominal": scores})
+    verdict = metrics.make_verdict(PAPER_LOSS, [0, 1], {"s": {"nominal": scores}})
     text = render("verdict.md.j2", verdict=verdict)
     assert "nan" not in text
     assert "| nominal | - | - | - | - | - | - |" in text

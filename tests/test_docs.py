@@ -17,7 +17,6 @@ from unittest import mock
 import jax
 import numpy as np
 import pytest
-import scipy.stats
 from model import BEST_OTHERS
 from table import PROGRAM, SETS
 from table import Flags as Table
@@ -264,7 +263,9 @@ def test_what_the_readme_says_of_the_verdict_of_best_is_in_its_file():
         assert all(change[base]["high"] < 0 for change in changes for base in change)
         medians = [-round(change["nominal"]["median"]) for change in changes]
         gains += [min(medians), max(medians), result["sets"][name]["falls"]]
-    walks = result["sets"]["best"]["walks"]
+    walks, share = (result["sets"]["best"][key] for key in ("walks", "share_of_plants"))
+    page = " ".join((DOCS / "results.md").read_text().split())
+    assert f"`best` fall in none (at most {100 * share['high']:.1f} % of plants)" in page
     assert f"below nominal and expert in {len(cells)} of {len(cells)} cases and no interval" in text
     assert (
         "`best` gains {} to {} % against nominal and falls in {} of {walks} walks, `integral` "
@@ -457,15 +458,12 @@ def test_the_falls_of_best_are_those_of_their_file():
     page = " ".join((DOCS / "results.md").read_text().split())
     readme = " ".join((ROOT / "README.md").read_text().split())
     walked = [(course, *item) for course, each in scenes.items() for item in each.items()]
-    none, falls, walks = 0, {"nominal": 0, "best": 0}, 0
+    none, more, falls, walks = 0, [], {"nominal": 0, "best": 0}, 0
     for course, scene, one in walked:
-        more = one["fell_where_nominal_did_not"]["best"]
-        fewer = one["nominal_fell_where_it_did_not"]["best"]
-        p = scipy.stats.binomtest(more, more + fewer, alternative="greater").pvalue if more else 1.0
-        assert p > 0.05, scene
         nominal, found = (one["falls"][name] for name in ("nominal", "best"))
         falls = {"nominal": falls["nominal"] + nominal, "best": falls["best"] + found}
         walks += one["walks"]
+        more += [found - nominal] * (found > nominal)
         none += not any(one["falls"].values())
         if {*one["falls"].values()} in ({0}, {one["walks"]}):
             continue
@@ -473,11 +471,13 @@ def test_the_falls_of_best_are_those_of_their_file():
         both = (
             f"{one['falls']['all_best']} | {L['all_best']} | {one['falls']['best_feedback_0.12']}"
         )
-        row = f"| {course}, {scene} | {nominal} | {found} | {p:.2f} | {L['best']} | {both} |"
+        row = f"| {course}, {scene} | {nominal} | {found} | {L['best']} | {both} |"
         assert " ".join(row.replace("push ", "").split()) in page
     assert f"In the other {none} kinds of scenes no set falls" in page
     assert f"falls in {falls['best']} of {walks} walks" in readme
-    assert f"`nominal` in {falls['nominal']}, and in none of {len(walked)} kinds" in readme
+    assert f"`nominal` in {falls['nominal']}; in {len(more)} of {len(walked)} kinds" in readme
+    assert f"In {len(more)} of {len(walked)} kinds of scenes `best` falls more often" in page
+    assert set(more) == {1}
     for file, text in (
         ("falls", "{best} times on s under 100 N and nominal {nominal} times"),
         ("falls-0-7-s", "it falls {best} times now"),

@@ -16,9 +16,11 @@ def mean_of(x):
     return x.mean(axis=-1)
 
 
-def _judge(**losses):
+def _judge(scenes=("s",), **losses):
+    """A verdict of losses by plant, the same in each of the scenes."""
     scores = {name: [pretend_score(x) for x in row] for name, row in losses.items()}
-    return metrics.make_verdict(PAPER_LOSS, range(len(next(iter(losses.values())))), scores)
+    seeds = range(len(next(iter(losses.values()))))
+    return metrics.make_verdict(PAPER_LOSS, seeds, dict.fromkeys(scenes, scores))
 
 
 def test_the_total_is_the_weighted_sum_of_the_parts():
@@ -85,7 +87,53 @@ def test_the_change_is_the_median_of_paired_ratios_not_the_ratio_of_means():
     assert change.high == pytest.approx(-1.0)
 
 
-def test_wins_are_counted_by_seed():
+@pytest.mark.parametrize("count", [8, 9])
+def test_copies_of_a_trajectory_have_its_values_and_its_intervals(count):
+    drawn = np.random.default_rng(count).lognormal(size=(2, count))
+    losses = dict(zip(("nominal", "tuned"), drawn, strict=True))
+    one, three = _judge(**losses), _judge(("a", "b", "c"), **losses)
+    assert metrics.compare(three, "tuned", "nominal") == metrics.compare(one, "tuned", "nominal")
+    mean = metrics.mean(one, "tuned")
+    assert mean.low < mean.value < mean.high
+    assert metrics.mean(three, "tuned") == pytest.approx(mean, rel=1e-12)
+
+
+def test_an_interval_over_trajectories_covers_as_one_over_plants_does(monkeypatch):
+    monkeypatch.setattr(metrics, "RESAMPLES", 1000)
+    rng, covers = np.random.default_rng(11), []
+    for _ in range(150):
+        losses = 1.0 + 0.1 * rng.normal(size=(8, 1)) + 0.03 * rng.normal(size=(8, 3))
+        walks = {
+            s: {"tuned": [pretend_score(x) for x in losses[:, i]]} for i, s in enumerate("abc")
+        }
+        found = metrics.mean(metrics.make_verdict(PAPER_LOSS, range(8), walks), "tuned")
+        pooled, plants = (metrics.bootstrap(mean_of, x) for x in (losses.ravel(), losses.mean(1)))
+        assert found == pytest.approx(plants, rel=1e-9)
+        covers.append([interval.low < 1.0 < interval.high for interval in (found, pooled)])
+    found, pooled = np.mean(covers, axis=0)
+    assert found >= 0.82
+    assert found > pooled + 0.1
+
+
+def test_three_plants_have_no_interval_on_however_many_trajectories():
+    verdict = _judge("abcd", nominal=[1.0, 2.0, 3.0], tuned=[0.5, 0.8, 1.8])
+    assert np.isnan(metrics.compare(verdict, "tuned", "nominal").change["L"][1:]).all()
+    assert np.isnan(metrics.mean(verdict, "tuned")[1:]).all()
+
+
+def test_the_seeds_of_a_result_are_its_plants_and_its_falls_and_wins_are_walks():
+    verdict = pretend_verdict(4, {("with", 1)}, scenes=("straight", "c", "s"))
+    assert verdict.walks == 12
+    found = metrics.as_result(verdict)["sets"]["with"]["standin"]
+    assert (found["seeds"], found["scenes"]) == ([0, 1, 2, 3], ["straight", "c", "s"])
+    assert found["falls"] == 3
+    losses = (verdict.scores[name].L for name in ("with", "without_ten"))
+    wins = metrics.compare(verdict, "with", "without_ten").wins
+    assert wins == np.mean(np.less(*losses))
+    assert np.shape(verdict.scores["with"].L) == (4, 3)
+
+
+def test_wins_are_counted_by_walk():
     verdict = _judge(nominal=[1.0, 1.0, 1.0, 1.0], tuned=[0.5, 0.9, 1.1, 1.0])
     assert metrics.compare(verdict, "tuned", "nominal").wins == 0.5
 
@@ -100,6 +148,15 @@ def test_a_comparison_counts_only_where_falls_differ_by_less_than_2_of_32(seeds,
     assert metrics.compare(verdict, "nominal", "with").counts is counts
 
 
+@pytest.mark.parametrize(("fell", "counts"), [(1, True), (2, False)])
+def test_the_margin_of_falls_is_one_of_walks(fell, counts):
+    fallen = np.arange(24).reshape(8, 3) < fell
+    verdict = pretend_verdict(8, scenes=("straight", "c", "s"))
+    scores = verdict.scores | {"with": verdict.scores["with"]._replace(fallen=fallen)}
+    verdict = verdict._replace(scores=scores)
+    assert metrics.compare(verdict, "with", "nominal").counts is counts
+
+
 def test_the_result_has_the_promised_keys_and_is_json():
     result = json.loads(json.dumps(metrics.as_result(pretend_verdict()), allow_nan=False))
     assert tuple(result["sets"]) == SETS
@@ -109,6 +166,7 @@ def test_the_result_has_the_promised_keys_and_is_json():
             assert found[part]["low"] <= found[part]["mean"] <= found[part]["high"]
         assert found["falls"] == 0
         assert found["seeds"] == list(range(8))
+        assert found["scenes"] == ["straight"]
         for baseline in {"nominal", "expert"} - {name}:
             assert {"median", "low", "high", "wins", "counts"} <= found["change"][baseline].keys()
     assert result["sets"]["with"]["standin"]["change"]["nominal"]["high"] < 0
@@ -119,13 +177,14 @@ def test_legs_that_touch_are_counted_up_to_a_fall():
     walk = pretend_walk(fall_at=2.0)._replace(legs_touch=touching)
     one = metrics.score(PAPER_LOSS, walk)
     assert one.legs_touch == pytest.approx(0.5)
-    verdict = metrics.make_verdict(PAPER_LOSS, [0, 1], {"with": [one, one]})
+    verdict = metrics.make_verdict(PAPER_LOSS, [0, 1], {"s": {"with": [one, one]}})
     assert metrics.as_result(verdict)["sets"]["with"]["standin"]["legs_touch"] == pytest.approx(1.0)
 
 
 def test_the_result_of_a_set_that_falls_at_once_is_still_json():
     walk = metrics.score(PAPER_LOSS, pretend_walk(fall_at=-1.0))
-    verdict = metrics.make_verdict(PAPER_LOSS, [0, 1], {"nominal": [walk] * 2, "with": [walk] * 2})
+    scores = {"s": {"nominal": [walk] * 2, "with": [walk] * 2}}
+    verdict = metrics.make_verdict(PAPER_LOSS, [0, 1], scores)
     found = metrics.as_result(verdict)["sets"]["with"]["standin"]
     found = json.loads(as_json(found))
     assert found["falls"] == 2
@@ -135,13 +194,12 @@ def test_the_result_of_a_set_that_falls_at_once_is_still_json():
 
 def test_a_missing_walk_or_a_loss_that_is_not_a_number_is_named():
     one = pretend_score(1.0)
-    with pytest.raises(ValueError, match="set 'with' has 1 walks for 2 seeds"):
-        metrics.make_verdict(PAPER_LOSS, [0, 1], {"with": [one]})
+    with pytest.raises(ValueError, match="set 'with' has 1 walks on c for 2 seeds"):
+        metrics.make_verdict(PAPER_LOSS, [0, 1], {"s": {"with": [one] * 2}, "c": {"with": [one]}})
+    lost = one._replace(losses=one.losses | {"L": np.array(np.nan)})
     with pytest.raises(ValueError, match=r"set 'with': the loss on seeds \[7\]"):
         metrics.make_verdict(
-            PAPER_LOSS,
-            [3, 7],
-            {"with": [one, one._replace(losses=one.losses | {"L": np.array(np.nan)})]},
+            PAPER_LOSS, [3, 7], {"s": {"with": [one] * 2}, "c": {"with": [one, lost]}}
         )
     with pytest.raises(ValueError, match="at least one seed"):
         metrics.make_verdict(PAPER_LOSS, [], {})

@@ -14,11 +14,9 @@ from hector_jax.core.environment import environment
 from hector_jax.report import report
 from hector_jax.report.report import Picture, print_table
 from hector_jax.report.run import tuning_section, write_report
-from hector_jax.runs.metrics import Verdict
 from hector_jax.runs.walks import Change
 from hector_jax.tuning.curvature import Curvature, Direction
 from hector_jax.tuning.difftune import Tuning
-from hector_jax.tuning.loss import PAPER_LOSS
 from hector_jax.tuning.status import StepStatus
 
 
@@ -92,7 +90,7 @@ def test_legs_that_touch_are_told_where_they_do(tmp_path):
     verdict = pretend_verdict()
     assert "touched" not in _printed(verdict)
     scores = dict(verdict.scores)
-    scores["with"] = scores["with"]._replace(legs_touch=np.array([0.03] + [0.0] * 7))
+    scores["with"] = scores["with"]._replace(legs_touch=np.array([[0.03]] + [[0.0]] * 7))
     verdict = verdict._replace(scores=scores)
     line = "The legs touched each other, which is no fall: with 0.030 s in all."
     assert line in _printed(verdict)
@@ -101,7 +99,7 @@ def test_legs_that_touch_are_told_where_they_do(tmp_path):
 
 def test_the_table_goes_without_baselines_that_were_not_walked():
     whole = pretend_verdict(2)
-    text = _printed(Verdict(whole.seeds, {"mine.json": whole.scores["with"]}, PAPER_LOSS))
+    text = _printed(whole._replace(scores={"mine.json": whole.scores["with"]}))
     assert "against" not in text
     assert "Change of L" not in text
     both = _printed(whole._replace(scores={n: whole.scores[n] for n in ("nominal", "with")}))
@@ -122,6 +120,22 @@ def test_one_plant_is_told_in_the_singular_and_without_an_interval():
         assert re.search(r"[+-]\d+ \[", text) is None
     assert "means over 1 plant (seed 0)." in report.legend(one)[0]
     assert "interval" not in report.legend(one)[1]
+
+
+def test_walks_on_several_trajectories_are_not_counted_as_plants(tmp_path):
+    verdict = pretend_verdict(4, {("with", 0)}, scenes=("straight", "c", "s"))
+    first, second, *_ = report.legend(verdict)
+    assert first.endswith("; means over 4 plants and 3 trajectories (seeds 0-3).")
+    assert "median over plants and trajectories of the paired ratio" in second
+    assert "intervals redraw the plants" in second
+    text = write_report(tmp_path, **_report(verdict)).read_text()
+    assert "the robot fell in 3 of 12 walks (4 plants, 3 trajectories)." in text
+    assert "| 3 / 12 |" in text
+    assert "12 plants" not in text
+    text = write_report(tmp_path, **_report(pretend_verdict(4, {("with", 0)}))).read_text()
+    assert "the robot fell on 1 of 4 plants." in text
+    assert "| 1 / 4 |" in text
+    assert "trajectories" not in text
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ def test_the_interval_redraws_plants_with_all_their_scenes():
     found = evaluate_level(scores(base * [[0.5], [0.5], [2.0], [2.0]], fell), scores(base))
     assert found.ratio == pytest.approx((1.25, 0.5, 2.0))
     assert found.survived == pytest.approx((0.5, 0.0, 1.0))
-    assert found.falls == 6
+    assert (found.falls, found.falls_by_plant) == (6, (0, 0, 3, 3))
     assert not found.counts
     alone = evaluate_level(scores(base[:1]), scores(base[:1]))
     assert np.isnan(alone.ratio.low)

@@ -25,7 +25,7 @@ def judged(seeds=4, fell=(), **levels):
         name: [pretend_score(level * w, (name, i) in fell) for i, w in enumerate(wobble)]
         for name, level in levels.items()
     }
-    return metrics.make_verdict(PAPER_LOSS, range(seeds), scores)
+    return metrics.make_verdict(PAPER_LOSS, range(seeds), {"s": scores})
 
 
 def with_losses(score, **losses):
@@ -106,7 +106,7 @@ def test_the_four_files_tell_the_same_numbers(tmp_path):
     told = json.loads((tmp_path / "table.json").read_text())
     kept = told["trajectories"]["c"]["sets"]["with"]["standin"]
     assert kept["change"]["nominal"]["median"] == pytest.approx(change.value)
-    assert kept["by_seed"]["L"] == verdict.scores["with"].L.tolist()
+    assert kept["by_seed"]["L"] == verdict.scores["with"].L[:, 0].tolist()
     with (tmp_path / "table.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 2 * 6 * 4
@@ -160,9 +160,9 @@ def test_every_fall_is_shown_and_the_comparison_marked(tmp_path):
 
 def test_a_set_that_falls_at_once_leaves_files_that_can_be_read(tmp_path):
     verdict = judged(fell={("with", i) for i in range(4)}, **GOOD)
-    lost = with_losses(verdict.scores["with"], L_ctrl=np.zeros(4))._replace(
-        rms_euler=np.full((4, 3), np.nan),
-        rms_position=np.full((4, 3), np.nan),
+    lost = with_losses(verdict.scores["with"], L_ctrl=np.zeros((4, 1)))._replace(
+        rms_euler=np.full((4, 1, 3), np.nan),
+        rms_position=np.full((4, 1, 3), np.nan),
     )
     scores = verdict.scores | {"with": lost}
     write_table(tmp_path, whole(s=verdict._replace(scores=scores)))

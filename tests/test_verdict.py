@@ -16,14 +16,13 @@ from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.inputs import InputError
-from hector_jax.core.tree import stack
 from hector_jax.report import matrix as report
 from hector_jax.report import plots
 from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import matrix, verdicts
 from hector_jax.runs.matrix import Column
-from hector_jax.runs.metrics import Verdict, family_of
+from hector_jax.runs.metrics import family_of, make_verdict
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import tune_config
 from hector_jax.sim.engine import MUJOCO_C
@@ -38,10 +37,10 @@ def cell(seeds=8, fallen=(), nominal=4e6, tuned=1e6):
     """Walks of sets on plants of which the losses differ alike; `fallen` pairs of set and seed."""
     plant = 1.0 + 0.1 * np.arange(seeds)
     scores = {
-        name: stack([pretend_score(L * p, (name, i) in fallen) for i, p in enumerate(plant)])
+        name: [pretend_score(L * p, (name, i) in fallen) for i, p in enumerate(plant)]
         for name, L in zip(SETS, (nominal, 3e6, tuned), strict=True)
     }
-    return Verdict(np.arange(seeds), scores, PAPER_LOSS)
+    return make_verdict(PAPER_LOSS, range(seeds), {"s": scores})
 
 
 def said(cells, differs=None):
@@ -72,8 +71,18 @@ def test_intervals_of_falls_are_exact():
     # P(X >= 1 | low) = P(X <= 1 | high) = 2.5 %
     assert 1.0 - (1.0 - one.low) ** 8 == pytest.approx(0.025)
     assert (1 - one.high) ** 8 + 8 * one.high * (1 - one.high) ** 7 == pytest.approx(0.025)
-    both = {(C, "s"): cell(4, [("with", 0)]), (HEAVY, "s"): cell(8, [("with", 0)])}
-    assert matrix.falls(both, "with")[:2] == (2, 12)
+
+
+def test_plants_are_the_sample_of_falls_over_engines_and_trajectories():
+    cells = {
+        (column, trajectory): cell(seeds, [("with", 0)])
+        for column, seeds in ((C, 8), (DRAKE, 4))
+        for trajectory in ("straight", "s")
+    }
+    assert matrix.falls(cells, "with") == (4, 24, 1, 8, matrix.fall_share(1, 8))
+    cells[HEAVY, "s"] = cell(8, [("with", 0), ("with", 5)])
+    assert matrix.falls(cells, "with") == (6, 32, 2, 8, matrix.fall_share(2, 8))
+    assert matrix.falls(cells, "nominal") == (0, 32, 0, 8, matrix.fall_share(0, 8))
 
 
 def test_kendalls_tau_tells_the_order_of_the_sets():
@@ -134,7 +143,7 @@ def test_few_plants_and_falls_are_said():
     claims, limits = said({(C, "s"): cell(3), (HEAVY, "s"): cell(4, [("with", 0)])})
     assert "Where no interval is clear of zero" not in claims  # falls already forbid the claim
     assert "Falls make 1 cell no comparison: s in MuJoCo C, heavy." in claims
-    assert "`with` falls in 1 of 7 walks: 14.3 [0.4, 57.9] %." in claims
+    assert "`with` falls in 1 of 7 walks, on 1 of 4 plants: 25.0 [0.6, 80.6] % of plants." in claims
     assert "no interval from fewer than four plants: MuJoCo C.\n" in limits
     assert "fewer than eight plants is coarse: MuJoCo C, heavy.\n" in limits
     claims, _ = said({(C, "s"): cell(3)})
@@ -173,6 +182,11 @@ def test_the_report_has_a_page_its_numbers_and_a_picture(tmp_path, drawn):
     assert [one["model"] for one in told["columns"]] == ["own", "heavy", "own"]
     there = told["columns"][1]["trajectories"]["s"]["with"]
     assert there["falls_share"]["value"] == 0.5
+    assert there["fallen_by_seed"] == [True, True, False, False]
+    assert len(there["L"]["by_seed"]) == 4
+    falls = ("falls", "walks", "fallen_plants", "plants")
+    assert [told["sets"]["with"][key] for key in falls] == [2, 24, 2, 4]
+    assert told["sets"]["with"]["share_of_plants"] == matrix.fall_share(2, 4)._asdict()
     assert there["change"]["nominal"]["counts"] is False
     assert told["sets"]["with"]["against"]["nominal"]["void"] == 1
     assert told["sets"]["with"]["against"]["nominal"]["worst"]["column"]["model"] == "heavy"

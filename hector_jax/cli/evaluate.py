@@ -60,7 +60,7 @@ def evaluate(args: Evaluate) -> None:
         title = f"evaluating on {plural(count, 'plant')} of {args.world}"
         inputs = Setup(pool, config, robot), sets, trajectory.command, plants, seeds
         walks = verdicts.judge(*inputs, title=title, seconds=seconds, plant=plant, engine=engine)
-    verdict = metrics.make_verdict(config.loss, seeds, walks.scores)
+    verdict = metrics.make_verdict(config.loss, seeds, {trajectory.name: walks.scores})
     title = f"{trajectory.name}, {plural(count, 'plant')}"
     result = metrics.as_result(verdict, args.world) | {"engine": engine.name}
     if plant is not None:

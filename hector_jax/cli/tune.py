@@ -297,10 +297,8 @@ def _result(
     """Write result.json; return its content and the verdicts, of all walks and by trajectory."""
 
     def verdict(names: Sequence[str], world: int) -> metrics.Verdict:
-        scored = [walks[name][world].scores for name in names]
-        scores = {key: [score for by_set in scored for score in by_set[key]] for key in tuned.sets}
-        seeds = ([*range(run.args.seeds)], [0])[world] * len(names)
-        return metrics.make_verdict(run.setup.config.loss, seeds, scores)
+        scores, plants = {name: walks[name][world].scores for name in names}, (run.args.seeds, 1)
+        return metrics.make_verdict(run.setup.config.loss, range(plants[world]), scores)
 
     def content(names: Sequence[str], standin: metrics.Verdict) -> dict[str, Any]:
         result = metrics.as_result(standin)

@@ -185,7 +185,8 @@ def walk_cells(setup: Setup, plan: Plan, folder: Path) -> Cells:
             walks = {name: [scored[*case, name, seed][0] for seed in seeds] for name in sets}
             verdicts.say_faults({f"{name} on {where}": of_set for name, of_set in walks.items()})
             scores = {name: [walk.score for walk in of_set] for name, of_set in walks.items()}
-            cells[column, trajectory] = metrics.make_verdict(setup.config.loss, seeds, scores)
+            by_scene, loss = {trajectory: scores}, setup.config.loss
+            cells[column, trajectory] = metrics.make_verdict(loss, seeds, by_scene)
     return cells
 
 

@@ -21,7 +21,7 @@ def compare_runs(runs: Sequence[Run]) -> dict[str, Any]:
     """Compare several runs, as JSON values.
 
     `runs` is a list of `run`, `seconds` (null if unknown), `sets.<name>` (the verdict on the
-    stand-in from result.json, with the number of seeds), `versions` and
+    stand-in from result.json, with the numbers of seeds and `walks`), `versions` and
     `tuning.<name>.{iterations, refused}`; `differ.settings` and `differ.versions` hold the entries
     that differ between the runs, one value per run, null if a run has none.
 
@@ -49,7 +49,10 @@ def compare_runs(runs: Sequence[Run]) -> dict[str, Any]:
 def _verdict(run: Run, name: str) -> dict[str, Any]:
     try:
         verdict = run.result["sets"][name]["standin"]
-        verdict = verdict | {"seeds": len(verdict["seeds"]), "falls": int(verdict["falls"])}
+        seeds = len(verdict["seeds"])
+        # files without scenes are from before: they have a seed for each walk
+        counts = {"seeds": seeds, "walks": seeds * len(verdict.get("scenes", [""]))}
+        verdict = verdict | counts | {"falls": int(verdict["falls"])}
         _cells(name, verdict)  # raises if the file lacks a printed value
         return verdict
     except (KeyError, TypeError, AttributeError, ValueError):
@@ -110,8 +113,8 @@ def print_comparison(comparison: Mapping[str, Any], console: Console | None = No
     if len(runs) > 1 and not any(differ.values()):
         console.print("All settings and versions are the same.")
     note = (
-        "L and L_ctrl are means over the plants, changes medians of L with 95 % intervals; "
-        f"{VOID} falls make a comparison void."
+        "L and L_ctrl are means over the walks, changes medians of L with 95 % intervals over "
+        f"plants; {VOID} falls make a comparison void."
     )
     console.print(Text(note, style="dim"))
 
@@ -127,4 +130,4 @@ def _cells(name: str, verdict: Mapping[str, Any]) -> dict[str, str]:
             cells[f"  against {baseline} [%]"] = text + VOID * (not change["counts"])
     if "L_ctrl" in verdict:  # a loss of one's own may be without
         cells["  L_ctrl [1e6]"] = f"{verdict['L_ctrl']['mean'] / 1e6:.3f}"
-    return cells | {"  falls": f"{verdict['falls']} of {verdict['seeds']}"}
+    return cells | {"  falls": f"{verdict['falls']} of {verdict['walks']}"}

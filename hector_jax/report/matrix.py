@@ -33,7 +33,7 @@ def cell_text(cell: tuple[Column, str]) -> str:
 
 
 def share_text(share: Interval) -> str:
-    """Format a share of walks with its interval, in %.
+    """Format a share of plants with its interval, in %.
 
     >>> share_text(Interval(0.125, 0.003, 0.527))
     '12.5 [0.3, 52.7] %'
@@ -168,7 +168,7 @@ def write_report(
         names=matrix.sets_of(cells),
         trajectories=matrix.trajectories_of(cells),
         count=len(matrix.columns_of(cells)),
-        walks=sum(len(v.scores) * len(v.seeds) for v in cells.values()),
+        walks=sum(len(v.scores) * v.walks for v in cells.values()),
     )
     write_json(folder / "verdict.json", result)
     write_file(folder / "report.md", text.encode())

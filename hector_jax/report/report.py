@@ -186,9 +186,9 @@ def _change(comparison: Comparison | None) -> Text:
     return Text(change_text(comparison, void=VOID), style=style if comparison.counts else "yellow")
 
 
-def wins_text(comparison: Comparison, seeds: int) -> str:
-    """Format the number of seeds on which the set is better."""
-    return f"{round(comparison.wins * seeds)} / {seeds}"
+def wins_text(comparison: Comparison, walks: int) -> str:
+    """Format the number of walks in which the set is better."""
+    return f"{round(comparison.wins * walks)} / {walks}"
 
 
 TEMPLATES = Environment(

@@ -5,8 +5,9 @@ after a tuning on walks.
 
 The rigid-body model is inexact: from some iteration on a tuning can gain on the model and lose on
 the robot. A few points of the path, including its start, therefore walk on plants drawn around the
-hfs that are used by no tuning and no evaluation. Their state estimate is noisy: a rollout knows its
-state exactly, so nothing keeps a tuning from gains that amplify noise.
+hfs that no evaluation and no tuning on the model uses. A tuning on walks does, later: its sets are
+compared on other plants. The state estimate of all these plants is noisy: a rollout knows its state
+exactly, so nothing keeps a tuning from gains that amplify noise.
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,8 +37,8 @@ the centre of mass (8 cm for HECTOR); width and velocity feedback of the steps a
 controller's."""
 HELD_OUT = 8
 """Number of the plants of `earliest`."""
-# first seed of the plants for choice and tuning, drawn like `hfs-varied` but with other seeds; the
-# plants of `earliest` have the seeds before it, so that none is among them however many there are
+# first seed of the plants of `choose`, `answer` and a tuning on walks, drawn like `hfs-varied` but
+# with other seeds; those of `earliest` have the seeds before it, so that none is among the former
 _FIRST_SEED = 7000
 
 
@@ -50,7 +51,7 @@ class Choice(NamedTuple):
 
 
 def drawn_plants(robot: Robot, count: int, first_seed: int = _FIRST_SEED) -> list[Imperfections]:
-    """Return plants drawn around the hfs; by default the first of those for choice and tuning."""
+    """Return plants drawn around the hfs; by default the first of `choose` and tuning on walks."""
     noisy = truth()._replace(**{name: np.asarray(sigma) for name, sigma in ESTIMATE_NOISE.items()})
     return [
         hfs_drawn(seed, 0.4, robot.description)._replace(estimator=noisy)
@@ -65,14 +66,14 @@ def _ratios(
     plants: Sequence[Imperfections],
     title: str,
     **notes: Any,
-) -> dict[str, Float[np.ndarray, " walks"]]:
-    """Return L of each set relative to the first set, by command and plant."""
+) -> dict[str, Float[np.ndarray, "commands plants"]]:
+    """Return L of each set relative to the first set."""
     title = f"{title} on {plural(len(plants), 'plant')} drawn around the hfs"
     judge = partial(verdicts.judge, setup, sets, title=title, **notes)
     results = [judge(command, plants, range(len(plants))).scores for command in commands]
     losses = {name: np.array([[s.L for s in scores[name]] for scores in results]) for name in sets}
     first = losses[next(iter(sets))]
-    return {name: (loss / first).ravel() for name, loss in losses.items()}
+    return {name: loss / first for name, loss in losses.items()}
 
 
 def choose(
@@ -203,8 +204,8 @@ def earliest(
 
     A tuning on the walks of a few plants fits them better and better, from some walk on at the
     expense of other plants. So its sets walk on plants on which none of them was tuned, and of
-    those that differ from the best by at most one standard error (of the paired differences of
-    log L) the earliest is taken.
+    those that differ from the best by at most one standard error the earliest is taken. The error
+    is that of the paired differences of log L over plants, each the mean over its commands.
 
     Args:
         setup, commands, notes: see `choose`.
@@ -215,7 +216,7 @@ def earliest(
     """
     plants = drawn_plants(setup.robot, HELD_OUT, _FIRST_SEED - HELD_OUT)
     ratios = _ratios(setup, sets, commands, plants, "comparing the tuned sets", **notes)
-    losses = {name: np.log(r) for name, r in ratios.items()}
+    losses = {name: np.log(ratio).mean(axis=0) for name, ratio in ratios.items()}
     best = min(losses, key=lambda name: losses[name].mean())
 
     def as_good(name: str) -> bool:

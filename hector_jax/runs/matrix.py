@@ -1,8 +1,9 @@
 """Comparison of weight sets in several engines and models: scores of walks, column by column.
 
 A column is a physics engine with a model of the robot; a cell is a column on one trajectory, with
-the walks of all sets on the same plants (a `Verdict`). The differences between columns show whether
-a change of the loss is due to the weights or to one simulator:
+the walks of all sets on the same plants (a `Verdict` of one scene). Cells are not independent of
+each other: plants of one seed are drawn alike in all columns. The differences between columns show
+whether a change of the loss is due to the weights or to one simulator:
 
 - the spread: the largest difference between engines of the median change on the same plants of the
   same model, beside the gain, the smallest reduction in any of these engines;
@@ -45,11 +46,13 @@ class Tally(NamedTuple):
 
 
 class Falls(NamedTuple):
-    """Falls of a set."""
+    """Falls of a set in some cells."""
 
-    falls: int
+    falls: int  # walks that end in one
     walks: int
-    share: Interval  # with its exact binomial (Clopper-Pearson) interval
+    fallen_plants: int  # seeds with a fall in at least one cell
+    plants: int  # seeds
+    share_of_plants: Interval
 
 
 class Worst(NamedTuple):
@@ -119,22 +122,23 @@ def tally(cells: Cells, name: str, baseline: str) -> Tally:
 
 
 def falls(cells: Cells, name: str) -> Falls:
-    """Count the falls of a set in some cells; the interval assumes independent walks."""
-    fallen = np.concatenate([verdict.scores[name].fallen for verdict in cells.values()])
-    count = int(fallen.sum())
-    return Falls(count, len(fallen), fall_share(count, len(fallen)))
+    """Count the falls of a set in some cells, and the plants on which it falls."""
+    seeds = np.concatenate([np.repeat(v.seeds, len(v.scenes)) for v in cells.values()])
+    fallen = np.concatenate([v.scores[name].fallen.ravel() for v in cells.values()])
+    plants = len(set(seeds[fallen])), len(set(seeds))
+    return Falls(int(fallen.sum()), len(seeds), *plants, fall_share(*plants))
 
 
-def fall_share(falls: int, walks: int) -> Interval:
-    """Return the share of walks that fall, with its exact binomial (Clopper-Pearson) interval.
+def fall_share(fallen: int, plants: int) -> Interval:
+    """Return the share of plants with a fall, with its exact (Clopper-Pearson) interval.
 
     >>> round(fall_share(0, 10).high, 4)  # 1 - 0.025^(1/10)
     0.3085
     """
     from scipy import stats  # takes most of a second to import
 
-    ends = stats.binomtest(falls, walks).proportion_ci(COVERAGE, method="exact")
-    return Interval(falls / walks, float(ends.low), float(ends.high))
+    ends = stats.binomtest(fallen, plants).proportion_ci(COVERAGE, method="exact")
+    return Interval(fallen / plants, float(ends.low), float(ends.high))
 
 
 def worst(cells: Cells, name: str, baseline: str) -> Worst:
@@ -144,8 +148,8 @@ def worst(cells: Cells, name: str, baseline: str) -> Worst:
         score = verdict.scores[name]
         change = 100.0 * (score.L / verdict.scores[baseline].L - 1.0)
         i = int(np.argmax(change))
-        seed, fallen = int(verdict.seeds[i]), bool(score.fallen[i])
-        candidates.append(Worst(column, trajectory, seed, float(change[i]), fallen))
+        seed, fallen = int(verdict.seeds[i]), bool(score.fallen[i, 0])
+        candidates.append(Worst(column, trajectory, seed, float(change[i, 0]), fallen))
     return max(candidates, key=lambda candidate: candidate.change)
 
 
@@ -192,8 +196,9 @@ def as_result(cells: Cells, family: str) -> dict[str, Any]:
     """Return all columns as JSON values: the content of verdict.json.
 
     `columns` is a list of `engine`, `model`, `seeds` and `trajectories.<name>`, each as the `sets`
-    of result.json, with `falls_share` beside `falls`; `sets.<name>.against.<baseline>` has the
-    counts of cells, the worst plant and the spreads; `kendall` is a list of pairs of columns.
+    of result.json, with `falls_share` and `fallen_by_seed` beside `falls`; `sets.<name>` has the
+    `Falls` in all cells, `.against.<baseline>` the counts of cells, the worst plant and the
+    spreads; `kendall` is a list of pairs of columns.
     """
     names = sets_of(cells)
     columns: list[dict[str, Any]] = []
@@ -224,7 +229,8 @@ def _cell(verdict: Verdict) -> dict[str, Any]:
     for name, worlds in metrics.as_result(verdict)["sets"].items():
         row, score = worlds["standin"], verdict.scores[name]
         row["falls_share"] = fall_share(row["falls"], len(verdict.seeds))._asdict()
-        row["L"] |= {"median": float(np.median(score.L)), "by_seed": score.L.tolist()}
+        row["fallen_by_seed"] = score.fallen[:, 0].tolist()
+        row["L"] |= {"median": float(np.median(score.L)), "by_seed": score.L[:, 0].tolist()}
         sets[name] = row
     return sets
 

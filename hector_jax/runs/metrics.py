@@ -1,13 +1,15 @@
-"""Comparison of weight sets and its uncertainty: scores of walks, paired over seeds.
+"""Comparison of weight sets and its uncertainty: scores of walks, paired over plants and scenes.
 
-Each walk has a `Score`. The scores of one weight set over the seeds of a world are stacked, and a
-`Verdict` holds those of all sets. The main result is the median over seeds of the ratio of the
-losses of two sets on the same seed (the same plant), as a change in %; means are given beside it.
-Intervals are percentile bootstraps over seeds: plants are resampled, each with the walks of both
-sets. With fewer than four plants there is no interval.
+Each walk has a `Score`. A `Verdict` holds those of all sets on the same plants (one per seed) and
+in the same scenes (trajectories). The main result is the median over all walks of the ratio of the
+losses of two sets on the same plant and scene, as a change in %; means are given beside it.
+
+Plants are the sample: walks of one plant are not independent. Intervals are percentile bootstraps
+that redraw plants, each with all its scenes and the walks of both sets. With fewer than four plants
+there is no interval.
 
 A fall stays in the numbers with the charge of the loss. A comparison counts only if neither set
-falls more often than the other by 2 of 32 seeds or the same share of fewer seeds.
+falls more often than the other by 2 of 32 walks or the same share.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -31,18 +33,18 @@ _TINY = 1e-9
 
 
 class Score(NamedTuple):
-    """Losses and errors of one walk or, with a first axis, of several."""
+    """Losses and errors of one walk or, with leading axes, of several."""
 
-    losses: dict[str, Float[np.ndarray, "*seeds"]]  # L, and its unweighted terms
-    switching: Float[np.ndarray, "*seeds"]  # the share of L_ctrl due to changes of stance
-    rms_euler: Float[np.ndarray, "*seeds 3"]  # roll, pitch, yaw [rad], up to a fall
-    rms_position: Float[np.ndarray, "*seeds 3"]  # x, y, z [m], up to a fall
-    fallen: Bool[np.ndarray, "*seeds"]
-    legs_touch: Float[np.ndarray, "*seeds"]  # [s] of contact between the legs, up to a fall
-    residual: Float[np.ndarray, "*seeds"]  # largest relative KKT residual of a plan
+    losses: dict[str, Float[np.ndarray, "*walks"]]  # L, and its unweighted terms
+    switching: Float[np.ndarray, "*walks"]  # the share of L_ctrl due to changes of stance
+    rms_euler: Float[np.ndarray, "*walks 3"]  # roll, pitch, yaw [rad], up to a fall
+    rms_position: Float[np.ndarray, "*walks 3"]  # x, y, z [m], up to a fall
+    fallen: Bool[np.ndarray, "*walks"]
+    legs_touch: Float[np.ndarray, "*walks"]  # [s] of contact between the legs, up to a fall
+    residual: Float[np.ndarray, "*walks"]  # largest relative KKT residual of a plan
 
     @property
-    def L(self) -> Float[np.ndarray, "*seeds"]:  # noqa: D102, N802
+    def L(self) -> Float[np.ndarray, "*walks"]:  # noqa: D102, N802
         return self.losses["L"]
 
 
@@ -65,19 +67,25 @@ class Interval(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """Comparison of two sets on the same seeds."""
+    """Comparison of two sets on the same plants and scenes."""
 
     change: dict[str, Interval]  # by part: median of the paired ratio, as a change in %
-    wins: float  # share of seeds on which the first set has the lower L
+    wins: float  # share of walks in which the first set has the lower L
     counts: bool  # neither set falls so much more often that losses are not comparable
 
 
 class Verdict(NamedTuple):
-    """Scores of all sets on the same seeds of one world."""
+    """Scores of all sets on the same plants of one world, in the same scenes."""
 
-    seeds: Int[np.ndarray, " seeds"]
-    scores: dict[str, Score]  # by set, stacked over seeds
+    seeds: Int[np.ndarray, " plants"]
+    scenes: tuple[str, ...]  # names of the trajectories
+    scores: dict[str, Score]  # by set, (plants, scenes) each
     loss: Loss
+
+    @property
+    def walks(self) -> int:
+        """Number of walks of each set."""
+        return len(self.seeds) * len(self.scenes)
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -88,8 +96,8 @@ class Verdict(NamedTuple):
 class Summary(NamedTuple):
     """Results of one set of a verdict."""
 
-    means: dict[str, Interval]  # over seeds, by part
-    falls: int  # seeds on which it falls
+    means: dict[str, Interval]  # over plants and scenes, by part
+    falls: int  # walks in which it falls
     against: dict[str, Comparison]  # by the other set
 
 
@@ -123,20 +131,20 @@ def score_like(*axes: int, loss: Loss = PAPER_LOSS) -> Score:
     return Score(parts, zero, vector, vector, zero.astype(bool), zero, zero)
 
 
-def _rms(error: Float[np.ndarray, "T 3"], rows: Bool[np.ndarray, " T"]) -> Float[np.ndarray, "3"]:
+def _rms(error: Float[np.ndarray, "*n 3"], rows: Bool[np.ndarray, "*n"]) -> Float[np.ndarray, "3"]:
     """Return the root mean square over some rows; NaN without rows."""
     return np.sqrt(np.mean(error[rows] ** 2, axis=0)) if rows.any() else np.full(3, np.nan)
 
 
 def make_verdict(
-    loss: Loss, seeds: Sequence[int], scores: Mapping[str, Sequence[Score]]
+    loss: Loss, seeds: Sequence[int], scores: Mapping[str, Mapping[str, Sequence[Score]]]
 ) -> Verdict:
     """Combine the walks of all sets into a verdict.
 
     Args:
         loss: loss of the scores.
         seeds: seeds of the plants, in the order of the scores.
-        scores: scores by set, one per seed.
+        scores: scores by scene and set, one per seed; all scenes have the same sets.
 
     Raises:
         ValueError: there are no seeds, or a set has another number of walks or a loss that is not
@@ -145,13 +153,16 @@ def make_verdict(
     if not len(seeds):
         raise ValueError("a verdict needs at least one seed, got none")
     stacked = {}
-    for name, walks in scores.items():
-        if len(walks) != len(seeds):
-            raise ValueError(f"set '{name}' has {len(walks)} walks for {len(seeds)} seeds")
-        stacked[name] = stack(walks)
-        if wrong := np.asarray(seeds)[~np.isfinite(stacked[name].L)].tolist():
+    for name in next(iter(scores.values())):
+        by_scene = [sets[name] for sets in scores.values()]
+        for scene, walks in zip(scores, by_scene, strict=True):
+            if len(walks) != len(seeds):
+                text = f"set '{name}' has {len(walks)} walks on {scene} for {len(seeds)} seeds"
+                raise ValueError(text)
+        stacked[name] = stack([stack(walks) for walks in zip(*by_scene, strict=True)])
+        if wrong := np.asarray(seeds)[~np.isfinite(stacked[name].L).all(axis=1)].tolist():
             raise ValueError(f"set '{name}': the loss on seeds {wrong} is not a finite number")
-    return Verdict(np.asarray(seeds, int), stacked, loss)
+    return Verdict(np.asarray(seeds, int), tuple(scores), stacked, loss)
 
 
 def bootstrap(statistic: Callable[..., Any], *samples: Shaped[np.ndarray, "n ..."]) -> Interval:
@@ -185,13 +196,15 @@ def bootstrap(statistic: Callable[..., Any], *samples: Shaped[np.ndarray, "n ...
 
 
 @lru_cache(maxsize=4096)  # table, report and JSON need the same intervals
-def _cached_bootstrap(values: bytes, statistic: Callable[..., Any]) -> Interval:
-    return bootstrap(partial(statistic, axis=-1), np.frombuffer(values))
+def _cached_bootstrap(values: bytes, plants: int, statistic: Callable[..., Any]) -> Interval:
+    by_plant = np.frombuffer(values).reshape(plants, -1)
+    return bootstrap(partial(statistic, axis=(-2, -1)), by_plant)
 
 
 def mean(verdict: Verdict, name: str, part: str = "L") -> Interval:
-    """Return the mean over seeds of a part of the loss."""
-    return _cached_bootstrap(verdict.scores[name].losses[part].tobytes(), np.mean)
+    """Return the mean over plants and scenes of a part of the loss."""
+    losses = verdict.scores[name].losses[part]
+    return _cached_bootstrap(losses.tobytes(), len(losses), np.mean)
 
 
 def falls_comparable(first: Bool[np.ndarray, "*walks"], second: Bool[np.ndarray, "*walks"]) -> bool:
@@ -200,13 +213,13 @@ def falls_comparable(first: Bool[np.ndarray, "*walks"], second: Bool[np.ndarray,
 
 
 def compare(verdict: Verdict, name: str, baseline: str) -> Comparison:
-    """Compare a set with a baseline, seed by seed."""
+    """Compare a set with a baseline, walk by walk."""
     score, base = verdict.scores[name], verdict.scores[baseline]
     change = {}
     for part in verdict.parts:
         # a walk that falls at once has no L_ctrl: keep its ratio finite
         ratio = (score.losses[part] + _TINY) / (base.losses[part] + _TINY)
-        median = _cached_bootstrap(ratio.tobytes(), np.median)
+        median = _cached_bootstrap(ratio.tobytes(), len(ratio), np.median)
         change[part] = Interval(*(100.0 * (r - 1.0) for r in median))
     wins = float(np.mean(score.L < base.L))
     return Comparison(change, wins, falls_comparable(score.fallen, base.fallen))
@@ -236,8 +249,8 @@ def as_result(verdict: Verdict, world: str = "standin") -> dict[str, Any]:
     """Return the verdict as JSON values: the content of result.json.
 
     `family` is that of the plants; results without this key are of the family `standin`.
-    `sets.<name>.<world>.<part>.{mean,low,high}`, `.falls`, `.seeds`, `.legs_touch` [s, all
-    walks together], `.L_ctrl_switching` and `.rms`, and
+    `sets.<name>.<world>.<part>.{mean,low,high}`, `.falls` of walks, `.seeds` of the plants,
+    `.scenes`, `.legs_touch` [s, all walks together], `.L_ctrl_switching` and `.rms`, and
     `sets.<name>.<world>.change.<baseline>.{median,low,high,wins,counts}` in %, of L, with those of
     the other parts under `.parts`.
     """
@@ -255,6 +268,7 @@ def _set_result(verdict: Verdict, name: str) -> dict[str, Any]:
         **_intervals("mean", summary.means),
         "falls": summary.falls,
         "seeds": verdict.seeds.tolist(),
+        "scenes": list(verdict.scenes),
         "legs_touch": float(scores.legs_touch.sum()),
         "residual": float(scores.residual.max()),
         "L_ctrl_switching": float(scores.switching.mean()),
@@ -276,7 +290,7 @@ def change_result(comparison: Comparison) -> dict[str, Any]:
 
 
 def rms(verdict: Verdict, name: str) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Return the RMS errors over all seeds: roll, pitch, yaw [rad], and x, y, z [m]."""
+    """Return the RMS errors over all walks: roll, pitch, yaw [rad], and x, y, z [m]."""
     # walks that fell at once have no errors
     mean = lambda x: _rms(x, np.isfinite(x).all(axis=-1))  # noqa: E731
     return mean(verdict.scores[name].rms_euler), mean(verdict.scores[name].rms_position)
