@@ -14,11 +14,14 @@ from hector_jax.robot.model import load_robot
 
 # without the flags of the tests, which a command would try in one more process
 USUAL = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+FAST = "--xla_cpu_enable_fast_math=true"
 WRONG = [
     ({"JAX_PLATFORMS": "abacus"}, "JAX does not start with JAX_PLATFORMS=abacus: "),
     ({"JAX_PLATFORMS": "tpu"}, "JAX does not start with JAX_PLATFORMS=tpu: "),
     ({"JAX_NUM_CPU_DEVICES": "x"}, "JAX does not start with JAX_NUM_CPU_DEVICES=x: Invalid value"),
     ({"XLA_FLAGS": "--nonsense=1"}, "XLA_FLAGS=--nonsense=1: Unknown flag in XLA_FLAGS"),
+    ({"XLA_FLAGS": f"{FAST} --xla_cpu_fast_math_honor_nans=false"}, f"XLA_FLAGS={FAST} "),
+    ({"XLA_FLAGS": f"{FAST} --xla_cpu_fast_math_honor_infs=false"}, f"XLA_FLAGS={FAST} "),
 ]
 
 
@@ -41,7 +44,7 @@ def test_what_jax_cannot_start_with_is_one_line(wrong, line):
     assert said[0].startswith(f"hector: {line}")
 
 
-@pytest.mark.parametrize(("wrong", "line"), WRONG[2:], ids=["JAX", "XLA"])
+@pytest.mark.parametrize(("wrong", "line"), WRONG[2:4], ids=["JAX", "XLA"])
 def test_the_doctor_names_what_jax_cannot_start_with(wrong, line):
     done = hector("doctor", "--json", env=USUAL | wrong)
     assert done.returncode == 1

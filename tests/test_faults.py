@@ -313,7 +313,7 @@ def test_settings_of_another_version_are_refused_by_name(monkeypatch, capsys, tm
 
 def test_a_dump_is_replayed_on_the_cpu(monkeypatch, dump):
     on_cpus = []
-    monkeypatch.setattr("hector_jax.cli.main.check_jax", lambda on_cpu: on_cpus.append(on_cpu))
+    monkeypatch.setattr("hector_jax.cli.main.start_jax", lambda on_cpu: on_cpus.append(on_cpu))
     assert call(monkeypatch, "replay", dump) == 0
     assert on_cpus == [True]
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")

@@ -17,6 +17,7 @@ from hector_jax.control.weights import expert
 from hector_jax.core.console import Broken, say
 from hector_jax.core.environment import environment
 from hector_jax.core.inputs import one_line
+from hector_jax.core.numerics import not_used
 from hector_jax.core.runtime import cache_folder
 from hector_jax.core.trajectory import SOLVED, Trajectory
 from hector_jax.report.motion import motions
@@ -67,6 +68,7 @@ def examine() -> tuple[dict[str, str], list[str]]:
     if jnp.asarray(0.0).dtype != jnp.float64:
         faults.append("JAX computes in 32 bits")
     facts["cache"] = str(cache_folder())
+    facts |= _variables()
     facts["engines"] = ", ".join(
         f"{name}: {engine.version or 'no'}" for name, engine in ENGINES.items()
     )
@@ -95,6 +97,15 @@ def examine() -> tuple[dict[str, str], list[str]]:
         if "MUJOCO_GL" in os.environ:  # the user chose a back end
             faults.append(f"MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}")
     return facts, faults
+
+
+def _variables() -> dict[str, str]:
+    """Return what the environment sets of JAX and XLA, and what was done with it."""
+    used = {name: text for name, text in os.environ.items() if name.startswith(("JAX_", "XLA_"))}
+    return {name: f"{used[name]} (used)" for name in sorted(used)} | {
+        name: f"{text} (not used: {name.lower()} is {jax.config.values[name.lower()]})"
+        for name, text in not_used().items()
+    }
 
 
 def _walks(robot: Robot) -> dict[str, Trajectory]:

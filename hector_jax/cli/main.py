@@ -15,7 +15,7 @@ from hector_jax.cli.flags import Completion, Doctor, Export, Replay
 from hector_jax.cli.parse import all_commands, check, from_line, resolve_latest
 from hector_jax.core.console import Broken, exit_code, say, say_if_slow
 from hector_jax.core.inputs import InputError
-from hector_jax.core.runtime import cache_folder, check_jax, home_cache, setup_jax
+from hector_jax.core.runtime import cache_folder, home_cache, start_jax
 
 
 def main() -> int:
@@ -33,8 +33,7 @@ def _run(words: Sequence[str]) -> None:
         if (cache := cache_folder()) != (default := home_cache()):
             say(f"{default} cannot be written: compiled programs are kept in {cache}")
         with say_if_slow("loading JAX and MuJoCo"):
-            check_jax(on_cpu=isinstance(args, Export | Replay))  # these refuse a GPU
-            setup_jax()
+            start_jax(on_cpu=isinstance(args, Export | Replay))  # these refuse a GPU
             from hector_jax.cli import commands  # after the flags: `hector --help` answers at once
     except InputError as error:
         if not isinstance(args, Doctor):
