@@ -108,6 +108,16 @@ def test_a_home_that_cannot_be_written_is_told_in_one_line(tmp_path):
     assert "result.json: cannot read" in said[1]
 
 
+def test_a_cache_whose_name_is_not_utf8_is_told_in_one_line(tmp_path):
+    environment = USUAL | {"XDG_CACHE_HOME": os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9")}
+    done = hector("walk", env=environment)
+    assert done.returncode == 2
+    assert done.stderr.startswith(
+        "hector: XDG_CACHE_HOME or the folder of the cache must be in UTF-8"
+    )
+    assert done.stderr.count("\n") == 1
+
+
 # Streams and signals
 
 TOY = """

@@ -57,6 +57,12 @@ def printable(text: str) -> str:
     return "".join(x if x.isprintable() else " " if x.isspace() else "?" for x in text)
 
 
+def check_utf8(what: str, name: str) -> None:
+    """Raise an InputError unless the name of a file or folder, as Python reads it, is UTF-8."""
+    if name != name.encode(errors="replace").decode():
+        raise InputError(f"{what} must be in UTF-8, got {name!r}")
+
+
 def plural(number: int, noun: str) -> str:
     """Return a number with its noun in the singular or plural.
 

@@ -24,7 +24,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-from hector_jax.core.inputs import InputError, one_line
+from hector_jax.core.inputs import InputError, check_utf8, one_line
 from hector_jax.core.numerics import pin_options, without_ynnpack
 
 _LEAST_MEMORY = 3e9  # [B] of address space: JAX alone takes 1.3 GB, compiling a walk 2.3 GB
@@ -40,7 +40,7 @@ def cache_folder() -> Path:
     """Return the folder of the compilation cache; a temporary one if the home is not writable.
 
     Raises:
-        InputError: no folder exists that only this user can write.
+        InputError: no folder exists that only this user can write, or its name is not UTF-8.
     """
     folder = home_cache()
     try:
@@ -63,6 +63,7 @@ def cache_folder() -> Path:
             ) from None
         folder = own / "jax"
         folder.mkdir(exist_ok=True)
+    check_utf8("XDG_CACHE_HOME or the folder of the cache", str(folder))  # JAX takes no other name
     return folder
 
 
