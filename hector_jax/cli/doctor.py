@@ -16,7 +16,7 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert
 from hector_jax.core.console import Broken, say
 from hector_jax.core.environment import environment
-from hector_jax.core.inputs import one_line
+from hector_jax.core.inputs import InputError, one_line
 from hector_jax.core.numerics import not_used
 from hector_jax.core.runtime import cache_folder
 from hector_jax.core.trajectory import SOLVED, Trajectory
@@ -25,7 +25,7 @@ from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film
 from hector_jax.robot.description import MODEL_PATH
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs.verdicts import walk_rigid_body
-from hector_jax.sim.engine import ENGINES
+from hector_jax.sim.engine import ENGINES, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import named_world
@@ -72,6 +72,11 @@ def examine() -> tuple[dict[str, str], list[str]]:
     facts["engines"] = ", ".join(
         f"{name}: {engine.version or 'no'}" for name, engine in ENGINES.items()
     )
+    for name in [name for name, engine in ENGINES.items() if engine.version]:
+        try:
+            choose_engine(name)
+        except InputError as error:
+            faults.append(str(error))
     facts["extras"] = ", ".join(
         f"{name}: {'yes' if find_spec(package) else 'no'} (for {use})"
         for name, (package, use) in _EXTRAS.items()

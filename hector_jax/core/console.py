@@ -22,7 +22,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from hector_jax.core.inputs import InputError, check_utf8, printable
+from hector_jax.core.inputs import InputError, check_utf8, outside_packages, printable
 
 console = Console(stderr=True, highlight=False)
 
@@ -179,7 +179,7 @@ def exit_code(name: str, work: Callable[[], None]) -> int:
     try:
         for word in sys.argv[1:]:
             check_utf8("names", word)  # they go into messages, tables and files
-        with _stoppable(name):
+        with _stoppable(name), outside_packages():
             try:
                 work()
             except SystemExit:  # from a parser that has printed its help

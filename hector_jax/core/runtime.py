@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from functools import cache
+from importlib import import_module
 from multiprocessing import active_children, parent_process
 from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.managers import SyncManager
@@ -24,8 +25,8 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-from hector_jax.core.inputs import InputError, check_utf8, one_line
-from hector_jax.core.numerics import pin_options, without_ynnpack
+from hector_jax.core.inputs import InputError, check_utf8, one_line, outside_packages
+from hector_jax.core.numerics import pin_options
 
 _LEAST_MEMORY = 3e9  # [B] of address space: JAX alone takes 1.3 GB, compiling a walk 2.3 GB
 
@@ -83,17 +84,18 @@ def start_jax(on_cpu: bool = False) -> None:
             f"{_LEAST_MEMORY / 1e9:g} GB"
         )
     flags = os.environ.get("XLA_FLAGS", "")
-    if flags and (fault := _fault_of_xla(flags)):
-        raise InputError(f"XLA_FLAGS={flags}: {fault}")
-    without_ynnpack()
     variables = [f"{name}={os.environ[name]}" for name in sorted(os.environ) if name[:4] == "JAX_"]
     try:
-        import jax
+        with outside_packages():
+            import_module("numpy.linalg")  # first: where it is broken, jaxlib prints a traceback
+            import jax
 
-        if on_cpu:
-            jax.config.update("jax_platforms", "cpu")
-        setup_jax()  # before the devices start, which read some options once
-        jax.devices()
+            if flags and (fault := _fault_of_xla(flags)):
+                raise InputError(f"XLA_FLAGS={flags}: {fault}")
+            if on_cpu:
+                jax.config.update("jax_platforms", "cpu")
+            setup_jax()  # before the devices start, which read some options once
+            jax.devices()
     except InputError:
         raise
     except Exception as error:  # of several types, some without a message
