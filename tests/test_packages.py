@@ -40,7 +40,7 @@ def place(folder, name, text):
 
 
 def hector(folder, *words):
-    paths = [str(folder), str(Path(__file__).parents[1])]
+    paths = [f"{folder}/", str(Path(__file__).parents[1])]
     return subprocess.run(
         [sys.executable, "-m", "hector_jax.cli.main", *words],
         env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
@@ -86,6 +86,7 @@ def raised(source, module="hector_jax.sim.some"):
         ("import hector_jax.nonsense", ModuleNotFoundError),
         ("from hector_jax.core.inputs import nonsense", ImportError),
         ("import numpy; numpy.zeros(-1)", ValueError),
+        ("raise RuntimeError('x') from ImportError('y', name='jax')", RuntimeError),
         ("import re; re.compile('(')", re.error),
         (
             "from hector_jax.core.inputs import InputError; raise InputError('x') from OSError()",

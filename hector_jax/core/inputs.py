@@ -43,8 +43,8 @@ def outside_packages() -> Iterator[None]:
 
 def _broken_package(error: Exception) -> str:
     """Return the line about the package that cannot be loaded; "" if the error is another one."""
-    while isinstance(error.__cause__, ImportError):  # the first one says most
-        error = error.__cause__
+    while isinstance(error, ImportError) and isinstance(error.__cause__, ImportError):
+        error = error.__cause__  # the first one says most
     frames = [frame for frame, _ in walk_tb(error.__traceback__)]
     modules = [_package(frame.f_globals.get("__name__", "")) for frame in frames]
     named, last = "", modules[-1] if modules else ""
@@ -60,8 +60,8 @@ def _broken_package(error: Exception) -> str:
         own, file = _file_of(package, _own_folders()), _file_of(package)
         if own and file != own and package != _package(__name__):
             folder = str(Path(file).parents[Path(file).name == "__init__.py"])
-            is_on_path = folder in os.environ.get("PYTHONPATH", "").split(os.pathsep)
-            remedy = f"take {folder} out of PYTHONPATH" if is_on_path else "rename it"
+            on_path = folder in _python_path()
+            remedy = f"take {folder} out of PYTHONPATH" if on_path else "rename it"
             reason = f"{one_line(error)[:150]}; it hides {own}: {remedy}"
             return f"{package} cannot be loaded from {file}: {reason}"
     if not isinstance(error, ImportError) or (is_ours and _file_of(named)):
@@ -76,10 +76,13 @@ def _package(module: str) -> str:
     return module.partition(".")[0]
 
 
+def _python_path() -> list[str]:
+    return list(map(os.path.abspath, os.environ.get("PYTHONPATH", "").split(os.pathsep)))
+
+
 def _own_folders() -> list[str]:
     """Return the folders of this Python's packages: neither of PYTHONPATH nor of the script."""
-    others = os.environ.get("PYTHONPATH", "").split(os.pathsep)
-    return [folder for folder in sys.path[1:] if folder not in others]
+    return [folder for folder in sys.path[1:] if os.path.abspath(folder) not in _python_path()]
 
 
 def _file_of(package: str, folders: list[str] | None = None) -> str:
