@@ -28,21 +28,23 @@ PINNED = {
     "jax_debug_nans": False,
     "jax_debug_infs": False,
 }
-# Beginnings of the names of options that are the user's.
-_FREE = (
-    # devices; not jax_default_device: programs ask for the default backend and compute there
-    *("jax_platform", "jax_backend_target", "jax_xla_backend", "jax_num_cpu_devices", "jax_pjrt_"),
-    *("jax_cuda_visible", "jax_rocm_visible", "jax_oneapi_visible", "jax_mock_gpu"),
-    # hosts
-    *("jax_distributed", "jax_mtls", "jax_check_proxy", "jax_cpu_collectives", "jax_cpu_get_"),
-    *("jax_cross_host", "jax_force_dcn", "jax_share_binary", "jax_sort_devices"),
-    *("jax_enable_preemption", "jax_enable_recoverability"),
-    # whether and how many compiled programs are kept
-    *("jax_enable_compilation_cache", "jax_compilation_cache_max_size"),
-    # logs, dumps and tracebacks
-    *("jax_log", "jax_debug_log", "jax_explain", "jax_captured_constants", "jax_pallas_verbose"),
-    *("jax_compiler_detailed_logging", "jax_dump", "jax_include", "jax_source_url", "jax_pprint"),
-    *("jax_traceback", "jax_tracer_error", "jax_send_traceback", "jax_hlo_source"),
+# beginnings of the names of options that are the user's
+_FREE = tuple(
+    (
+        # devices; not jax_default_device: programs ask for the default backend and compute there
+        "jax_platform jax_backend_target jax_xla_backend jax_num_cpu_devices jax_pjrt_"
+        " jax_cuda_visible jax_rocm_visible jax_oneapi_visible jax_mock_gpu"
+        # hosts
+        " jax_distributed jax_mtls jax_check_proxy jax_cpu_collectives jax_cpu_get_"
+        " jax_cross_host jax_force_dcn jax_share_binary jax_sort_devices"
+        " jax_enable_preemption jax_enable_recoverability"
+        # whether and how many compiled programs are kept
+        " jax_enable_compilation_cache jax_compilation_cache_max_size"
+        # logs, dumps and tracebacks
+        " jax_log jax_debug_log jax_explain jax_captured_constants jax_pallas_verbose"
+        " jax_compiler_detailed_logging jax_dump jax_include jax_source_url jax_pprint"
+        " jax_traceback jax_tracer_error jax_send_traceback jax_hlo_source"
+    ).split()
 )
 _YNNPACK = "--xla_cpu_experimental_ynn_fusion_type"
 
