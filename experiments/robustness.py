@@ -221,7 +221,7 @@ def report(
     }
     return write_report(
         folder / "report.md",
-        "How much the weight sets survive",
+        f"How much the weight sets survive on {flags.scenes.traj}",
         paragraphs,
         numbers=numbers,
         json_name="robustness.json",

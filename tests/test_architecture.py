@@ -148,6 +148,36 @@ def test_every_public_name_is_there_and_importing_the_package_imports_nothing_el
         hector_jax.tuna  # noqa: B018
 
 
+WRITERS = ("write_text", "write_bytes", "savefig", "save", "savez", "move")
+# into memory, into a folder that is removed, or nowhere
+NOT_LEFT = {"runs.export: savez", "report.plots.style: savefig", "core.tree_file: open"}
+NOT_LEFT |= {"report.video: write_bytes", "report.render: save", "report.view: open"}
+
+
+def writes(tree):
+    """The names of calls that write a file."""
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Call):
+            continue
+        name = node.func.attr if isinstance(node.func, ast.Attribute) else ""
+        name = node.func.id if isinstance(node.func, ast.Name) else name
+        words = [
+            x.value for x in (*node.args, *(k.value for k in node.keywords)) if hasattr(x, "value")
+        ]
+        if name in WRITERS or (name == "open" and {"w", "x", "a", "wb", "xb", "ab"} & set(words)):
+            yield name
+
+
+def test_a_file_is_written_in_one_step_or_not_at_all():
+    """By `core.files`, so that no part of one is left where a disk gets full."""
+    found = {
+        f"{'.'.join(path.relative_to(ROOT).with_suffix('').parts)}: {name}"
+        for path in ROOT.rglob("*.py")
+        for name in writes(ast.parse(path.read_text()))
+    }
+    assert {x for x in found if not x.startswith("core.files: ")} == NOT_LEFT
+
+
 def test_what_scripts_import_inside_functions_is_there_too():
     missing = []
     for folder in ("benchmarks", "experiments", "examples", "hector_jax"):

@@ -203,6 +203,7 @@ def test_mjx_takes_any_robot_and_knows_what_may_not_touch_the_floor(strider):
             ["model must be the name of a file beside it", "got '../strider.xml'"],
         ),
         ('"strider.xml"', '"other.xml"', ["other.xml", "cannot read"]),
+        ('model = "strider.xml"', "", ["robot.toml: model is missing", "MJCF or URDF, beside"]),
         ('"strider"', '"a/b"', ["name must be letters", "names a folder", "got 'a/b'"]),
         ('"left_knee"', '"left_nee"', ["no joint 'left_nee'", "did you mean 'left_knee'?"]),
         ('"left_sole"', '"left_soul"', ["no site 'left_soul'", "did you mean 'left_sole'?"]),

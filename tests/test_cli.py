@@ -28,6 +28,7 @@ from hector_jax.control.weights import (
 )
 from hector_jax.control.weights_file import best, load_weights, save_weights
 from hector_jax.core.console import exit_code
+from hector_jax.core.inputs import InputError
 from hector_jax.grfm.collection import load_walks
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.effect import last_command
@@ -539,6 +540,15 @@ def test_a_doctor_that_finds_a_fault_leaves_with_one(monkeypatch, capsys):
     faults = [f"self-test: the robot does not walk in {world}" for world in walks]
     assert json.loads(out)["faults"] == faults
     assert err.splitlines()[-1] == f"hector: {'; '.join(faults)}"
+
+
+def test_the_doctor_names_an_engine_that_cannot_be_loaded(monkeypatch):
+    def choose(name):
+        raise InputError(f"{name} is of another Python")
+
+    monkeypatch.setattr(doctor, "choose_engine", choose)
+    monkeypatch.setattr(doctor, "load_robot", lambda: json.loads("no robot"))  # nor a walk
+    assert {"c is of another Python", "mjx is of another Python"} < set(doctor.examine()[1])
 
 
 def test_a_sound_machine_passes_the_doctor(monkeypatch, capsys):

@@ -14,11 +14,14 @@ from hector_jax.robot.model import load_robot
 
 # without the flags of the tests, which a command would try in one more process
 USUAL = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+FAST = "--xla_cpu_enable_fast_math=true"
 WRONG = [
     ({"JAX_PLATFORMS": "abacus"}, "JAX does not start with JAX_PLATFORMS=abacus: "),
     ({"JAX_PLATFORMS": "tpu"}, "JAX does not start with JAX_PLATFORMS=tpu: "),
     ({"JAX_NUM_CPU_DEVICES": "x"}, "JAX does not start with JAX_NUM_CPU_DEVICES=x: Invalid value"),
     ({"XLA_FLAGS": "--nonsense=1"}, "XLA_FLAGS=--nonsense=1: Unknown flag in XLA_FLAGS"),
+    ({"XLA_FLAGS": f"{FAST} --xla_cpu_fast_math_honor_nans=false"}, f"XLA_FLAGS={FAST} "),
+    ({"XLA_FLAGS": f"{FAST} --xla_cpu_fast_math_honor_infs=false"}, f"XLA_FLAGS={FAST} "),
 ]
 
 
@@ -41,7 +44,7 @@ def test_what_jax_cannot_start_with_is_one_line(wrong, line):
     assert said[0].startswith(f"hector: {line}")
 
 
-@pytest.mark.parametrize(("wrong", "line"), WRONG[2:], ids=["JAX", "XLA"])
+@pytest.mark.parametrize(("wrong", "line"), WRONG[2:4], ids=["JAX", "XLA"])
 def test_the_doctor_names_what_jax_cannot_start_with(wrong, line):
     done = hector("doctor", "--json", env=USUAL | wrong)
     assert done.returncode == 1
@@ -103,6 +106,16 @@ def test_a_home_that_cannot_be_written_is_told_in_one_line(tmp_path):
     assert said[0].startswith(told)
     assert len(said) == 2
     assert "result.json: cannot read" in said[1]
+
+
+def test_a_cache_whose_name_is_not_utf8_is_told_in_one_line(tmp_path):
+    environment = USUAL | {"XDG_CACHE_HOME": os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9")}
+    done = hector("walk", env=environment)
+    assert done.returncode == 2
+    assert done.stderr.startswith(
+        "hector: XDG_CACHE_HOME or the folder of the cache must be in UTF-8"
+    )
+    assert done.stderr.count("\n") == 1
 
 
 # Streams and signals

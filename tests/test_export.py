@@ -27,7 +27,7 @@ from hector_jax.control.contact import LINE_FRICTION
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
-from hector_jax.control.reference import named_command
+from hector_jax.control.reference import Command, named_command
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.inputs import InputError
@@ -46,7 +46,7 @@ from hector_jax.runs.export import (
     weights_cpp,
     weights_schema,
 )
-from hector_jax.runs.export_controller import Check, check, record
+from hector_jax.runs.export_controller import Check, _measured, check, record
 
 pytestmark = pytest.mark.usefixtures("on_cpu")
 ROBOT, CONFIG = load_robot(), WalkConfig()
@@ -253,7 +253,15 @@ def test_another_factor_or_order_would_be_noticed(spoilt):
 def test_the_page_says_what_the_cpp_controller_lacks_and_the_header_our_numbers():
     text = weights_cpp(nominal(), CONFIG, ROBOT, name="nominal")
     page = (Path(__file__).parents[1] / "docs" / "export.md").read_text()
-    for fact in ("0.04 s", "9.0 kg", "footholds", "toe and heel swapped", "0.01 N m", "M_z"):
+    for fact in (
+        "0.04 s",
+        "9.0 kg",
+        "footholds",
+        "toe and heel swapped",
+        "0.01 N m",
+        "at most 5 cm",
+        "M_z",
+    ):
         assert fact in page
     for fact in ("steps of 0.03 s, 10 of them", "F_z <= M_y <=", "docs/export.md"):
         assert fact in text
@@ -320,6 +328,90 @@ def test_the_loaded_controller_answers_as_the_live_one_did(loaded):
     assert found.unsolved == 0
     assert np.abs(walked.wrench.force).max() > 100.0
     assert walked.measurement.state.velocity[-1, 0] > 0.1
+
+
+def circle(turn, seconds):
+    """A walk that turns to the left (1) or to the right (-1), a half circle in 2 s."""
+    command = Command(np.full(2, 4.0), np.array([[0.2, 0.0]] * 2), np.full(2, turn * 0.5 * np.pi))
+    return record(CONFIG, ROBOT, TUNED, command=command, seconds=seconds)
+
+
+@pytest.fixture(scope="module", params=[1, -1], ids=["left", "right"])
+def turning(request):
+    return circle(request.param, 2.4)
+
+
+def seen_as(walked, see, **anchors):
+    """The record with the yaw as an IMU gives it: `see` of the continuous one."""
+    euler = walked.measurement.state.euler.copy()
+    euler[:, 2] = see(euler[:, 2])
+    state = walked.measurement.state._replace(euler=euler)
+    return walked._replace(measurement=walked.measurement._replace(state=state), **anchors)
+
+
+def to_pi(yaw):
+    """In (-pi, pi]."""
+    return np.pi - np.mod(np.pi - yaw, 2 * np.pi)
+
+
+YAWS = {
+    "(-pi, pi]": to_pi,
+    "[0, 2 pi)": lambda yaw: np.mod(yaw, 2 * np.pi),
+    "continuous, some turns away": lambda yaw: yaw + 6 * np.pi,
+    "any": lambda yaw: yaw + 2 * np.pi * np.random.default_rng(0).integers(-3, 4, len(yaw)),
+}
+
+
+@pytest.mark.parametrize("see", YAWS.values(), ids=YAWS)
+def test_the_measured_yaw_may_be_of_any_turn(loaded, turning, see):
+    assert abs(turning.measurement.state.euler[-1, 2]) > 3.3
+    found = check(CONFIG, *loaded, seen_as(turning, see))
+    assert max(found.force, found.moment, found.torque) <= TOLERANCE
+    assert found.unsolved == 0
+
+
+def answers(loaded, walked):
+    """Forces, moments and torques along a record."""
+    control, example = loaded
+    measured, carry, rows = _measured(walked.measurement), example[0], []
+    command = walked.command._asdict()
+    for i in range(len(walked.torque)):
+        row = {name: values[i] for name, values in measured.items()}
+        anchor = (walked.standing if i < walked.lead else walked.anchor)._asdict()
+        carry, out = control(carry, np.int32(i), row, command, anchor)
+        rows.append([out[name] for name in ("force", "moment", "torque")])
+    return [np.stack(column) for column in zip(*rows, strict=True)]
+
+
+@pytest.mark.parametrize("turn", [1, -1], ids=["left", "right"])
+def test_a_robot_may_start_near_half_a_circle_and_be_told_so_in_another_turn(loaded, turn):
+    """The anchor is next to the measured yaw too, and so is one that comes after several turns."""
+    walked, start = circle(turn, 0.3), turn * 3.1
+    shift = lambda anchor, yaw: anchor._replace(yaw=np.asarray(anchor.yaw + yaw))  # noqa: E731
+
+    def begun(see, standing, anchor):
+        anchors = {
+            "standing": shift(walked.standing, standing),
+            "anchor": shift(walked.anchor, anchor),
+        }
+        return answers(loaded, seen_as(walked, lambda yaw: see(yaw + start), **anchors))
+
+    continuous = begun(lambda yaw: yaw, start, start)
+    again = begun(to_pi, start - 2 * np.pi, start + 4 * np.pi)
+    for one, other in zip(continuous, again, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-8)
+    assert np.abs(continuous[0]).max() > 100.0
+    assert abs(start + walked.measurement.state.euler[-1, 2]) > np.pi
+
+
+def test_a_yaw_that_is_no_number_is_seen_and_then_forgotten(loaded):
+    control, (carry, _, measured, command, anchor) = loaded
+    lost = measured | {"euler": np.array([0.0, 0.0, np.nan])}
+    torques = []
+    for i, now in enumerate([measured, measured, lost, measured]):
+        carry, out = control(carry, np.int32(i), now, command, anchor)
+        torques.append(np.isfinite(out["torque"]).all())
+    assert torques == [True, True, False, True]
 
 
 @pytest.mark.parametrize(("weights", "part"), [(nominal, "force"), (expert, "torque")])

@@ -249,3 +249,47 @@ def test_what_was_given_is_noted_through_files_and_latest(tmp_path, monkeypatch)
     assert args.given == {"config", "first_seed", "seeds"}
     assert args.is_given("first_seed")
     assert not args.is_given("world")
+
+
+# Names that are not text
+
+
+def names_of_files():
+    """Every flag of every command that names a file or a folder."""
+    return [
+        (name, field)
+        for name, kind in COMMANDS.items()
+        for field in fields(kind)
+        if "Path" in str(field.type) or "Source" in str(field.type)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "field"), names_of_files(), ids=lambda x: x if isinstance(x, str) else x.name
+)
+@pytest.mark.parametrize("exists", [True, False])
+def test_a_name_that_is_not_utf8_is_refused(monkeypatch, capsys, tmp_path, name, field, exists):
+    wrong = os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.toml")
+    if exists:
+        Path(wrong).write_text("")
+    flag = [] if field.default is MISSING else [f"--{field.name}"]
+    line = refused(monkeypatch, capsys, name, *flag, wrong)
+    assert line == f"hector: names must be in UTF-8, got '{tmp_path}/caf\\udce9.toml'"
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+def test_no_name_makes_a_message_or_a_result_unprintable(tmp_path, encoding):
+    """Not that of the current folder, of the cache or of a command."""
+    odd = os.fsencode(tmp_path) + b"/caf\xe9"
+    os.mkdir(odd)
+    environment = os.environb | {b"XDG_CACHE_HOME": odd, b"PYTHONIOENCODING": encoding.encode()}
+    environment[b"PYTHONPATH"] = os.fsencode(Path(__file__).parents[1])
+    program = "import sys; from hector_jax.core import console, runtime\n"
+    program += "sys.exit(console.exit_code('toy', lambda: print(runtime.home_cache())))"
+    for words in (["-c", program], ["-m", "hector_jax.cli.main", b"w\xe9lk"]):
+        done = subprocess.run(
+            [sys.executable, *words], cwd=odd, env=environment, capture_output=True, text=True
+        )
+        assert "Traceback" not in done.stderr
+        assert done.returncode == (0 if words[0] == "-c" else 2)
+        assert (done.stdout + done.stderr).count("\n") == 1

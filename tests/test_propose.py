@@ -1,8 +1,10 @@
 """What `hector robot` finds in a model, the TOML that it proposes, and the rules of its numbers."""
 
 import re
+import resource
 import sys
 import tomllib
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -239,6 +241,28 @@ def test_a_proposal_is_written_once_and_beside_its_model(monkeypatch, capsys, tm
     ):
         assert call(monkeypatch, model, "--out", wrong) == 2
         assert text in capsys.readouterr().err
+
+
+@contextmanager
+def full_disk():
+    """No file of this process grows beyond a hundred bytes."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+def test_a_disk_that_gets_full_leaves_no_part_of_a_proposal(monkeypatch, capsys, tmp_path):
+    model, out = small(tmp_path).model, tmp_path / "robot.toml"
+    before = sorted(tmp_path.iterdir())
+    with full_disk():
+        assert call(monkeypatch, model, "--out", out) == 1
+    assert f"hector: cannot write {out}: File too large" in capsys.readouterr().err
+    assert sorted(tmp_path.iterdir()) == before
+    assert call(monkeypatch, model, "--out", out) == 0
+    assert read_description(out).model == model
 
 
 def test_a_model_that_cannot_be_used_is_shown_as_far_as_it_goes(monkeypatch, capsys, tmp_path):

@@ -5,13 +5,16 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from hector_jax.control.reference import named_command
 from hector_jax.control.trajectories import command_of
 from hector_jax.control.weights import nominal
 from hector_jax.core import runtime
+from hector_jax.core.numerics import without_ynnpack
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import tunings
 from hector_jax.runs.setup import Setup
@@ -60,6 +63,14 @@ def test_importing_the_library_leaves_jax_alone_and_computes_nothing():
 def test_a_worker_computes_in_64_bits():
     with runtime.workers(1) as pool:
         assert pool.submit(jnp.zeros, 3).result(timeout=60).dtype == jnp.float64
+
+
+def test_a_worker_draws_what_its_parent_draws(monkeypatch):
+    monkeypatch.setenv("JAX_RANDOM_SEED_OFFSET", "1")
+    monkeypatch.setenv("JAX_DEFAULT_PRNG_IMPL", "rbg")
+    with runtime.workers(1) as pool:
+        drawn = pool.submit(jax.random.PRNGKey, 3).result(timeout=60)
+    np.testing.assert_array_equal(drawn, jax.random.PRNGKey(3))
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinity on this system")
@@ -117,6 +128,6 @@ def test_ynnpack_is_turned_off_where_the_flag_is_known(monkeypatch, version, bef
     before, after = (text.replace("FLAG", flag) for text in (before, after))
     monkeypatch.setattr("jaxlib.version.__version_info__", version)
     monkeypatch.setenv("XLA_FLAGS", before)
-    runtime._without_ynnpack()
+    without_ynnpack()
     known = (0, 10, 2) <= version < (0, 13)
     assert os.environ["XLA_FLAGS"] == (after if known else before)

@@ -27,7 +27,7 @@ LONG = Description(joints=tuple(f"joint_{i}" for i in range(14)), linkage=None)
 
 def described(folder, text):
     path = folder / "robot.toml"
-    path.write_text(text)
+    path.write_text(f'model = "hector.xml"\n{text}')
     return path
 
 

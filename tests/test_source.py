@@ -311,7 +311,7 @@ def test_contacts_are_one_two_or_four_and_level(tmp_path):
     assert "soles are not level" in refused(small(tmp_path, contacts=tilted))
     path = tmp_path / "robot.toml"
     three = "{ body = 'a', contacts = [[0, 0, 0], [1, 0, 0], [0, 1, 0]] }"
-    path.write_text(f"[feet]\nleft = {three}\nright = {three}\n")
+    path.write_text(f"model = 'small.xml'\n[feet]\nleft = {three}\nright = {three}\n")
     with pytest.raises(ValueError, match="1, 2 or 4 contacts"):
         read_description(path)
 

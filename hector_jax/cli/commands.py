@@ -12,7 +12,7 @@ from hector_jax.control.weights import expert
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.console import say
 from hector_jax.core.environment import versions
-from hector_jax.core.files import locked, make_folder, write_json
+from hector_jax.core.files import locked, make_folder, write_file, write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
 from hector_jax.grfm.training import TrainConfig
@@ -167,11 +167,7 @@ def examine_robot(args: flags.Robot) -> None:
     if out is None:
         print(f"\n{text}", end="")
         return
-    try:
-        with out.open("x", encoding="utf-8") as stream:
-            stream.write(text)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written: {error.strerror}") from None
+    write_file(out, text.encode())
     say(f"the proposal is in {out}; walk with it: hector walk --robot {out}")
 
 

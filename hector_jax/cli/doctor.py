@@ -16,7 +16,8 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert
 from hector_jax.core.console import Broken, say
 from hector_jax.core.environment import environment
-from hector_jax.core.inputs import one_line
+from hector_jax.core.inputs import InputError, one_line
+from hector_jax.core.numerics import not_used
 from hector_jax.core.runtime import cache_folder
 from hector_jax.core.trajectory import SOLVED, Trajectory
 from hector_jax.report.motion import motions
@@ -24,16 +25,16 @@ from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film
 from hector_jax.robot.description import MODEL_PATH
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs.verdicts import walk_rigid_body
-from hector_jax.sim.engine import ENGINES
+from hector_jax.sim.engine import ENGINES, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import named_world
 
-_EXTRAS = {  # name: (package that it needs, what needs it)
-    "export": ("flatbuffers", "hector export"),
-    "race": ("botorch", "experiments/race.py"),
-    "search": ("cmaes", "hector search, experiments/table.py"),
-    "view": ("viser", "hector view"),
+_EXTRAS = {  # name: (packages that it needs, what needs it)
+    "export": (("flatbuffers",), "hector export"),
+    "race": (("botorch", "cma"), "experiments/race.py"),
+    "search": (("cmaes", "tinygp"), "hector search, tune --walks and propose"),
+    "view": (("viser",), "hector view"),
 }
 
 
@@ -66,12 +67,18 @@ def examine() -> tuple[dict[str, str], list[str]]:
     if jnp.asarray(0.0).dtype != jnp.float64:
         faults.append("JAX computes in 32 bits")
     facts["cache"] = str(cache_folder())
+    facts |= _variables()
     facts["engines"] = ", ".join(
         f"{name}: {engine.version or 'no'}" for name, engine in ENGINES.items()
     )
+    for name in [name for name, engine in ENGINES.items() if engine.version]:
+        try:
+            choose_engine(name)
+        except InputError as error:
+            faults.append(str(error))
     facts["extras"] = ", ".join(
-        f"{name}: {'yes' if find_spec(package) else 'no'} (for {use})"
-        for name, (package, use) in _EXTRAS.items()
+        f"{name}: {'yes' if all(map(find_spec, packages)) else 'no'} (for {use})"
+        for name, (packages, use) in _EXTRAS.items()
     )
     try:
         robot = load_robot()
@@ -94,6 +101,15 @@ def examine() -> tuple[dict[str, str], list[str]]:
         if "MUJOCO_GL" in os.environ:  # the user chose a back end
             faults.append(f"MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}")
     return facts, faults
+
+
+def _variables() -> dict[str, str]:
+    """Return what the environment sets of JAX and XLA, and what was done with it."""
+    used = {name: text for name, text in os.environ.items() if name.startswith(("JAX_", "XLA_"))}
+    return {name: f"{used[name]} (used)" for name in sorted(used)} | {
+        name: f"{text} (not used: {name.lower()} is {jax.config.values[name.lower()]})"
+        for name, text in not_used().items()
+    }
 
 
 def _walks(robot: Robot) -> dict[str, Trajectory]:

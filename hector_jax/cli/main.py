@@ -11,11 +11,17 @@ import logging
 import sys
 from collections.abc import Sequence
 
-from hector_jax.cli.flags import Completion, Doctor, Export
-from hector_jax.cli.parse import all_commands, check, from_line, resolve_latest
-from hector_jax.core.console import Broken, exit_code, say, say_if_slow
-from hector_jax.core.inputs import InputError
-from hector_jax.core.runtime import cache_folder, check_jax, home_cache, setup_jax
+from hector_jax.core.inputs import InputError, outside_packages
+
+try:
+    with outside_packages():
+        from hector_jax.cli.flags import Completion, Doctor, Export
+        from hector_jax.cli.parse import all_commands, check, from_line, resolve_latest
+        from hector_jax.core.console import Broken, exit_code, say, say_if_slow
+        from hector_jax.core.runtime import cache_folder, home_cache, start_jax
+except InputError as error:
+    print(f"hector: {error}", file=sys.stderr)
+    sys.exit(2)
 
 
 def main() -> int:
@@ -33,9 +39,9 @@ def _run(words: Sequence[str]) -> None:
         if (cache := cache_folder()) != (default := home_cache()):
             say(f"{default} cannot be written: compiled programs are kept in {cache}")
         with say_if_slow("loading JAX and MuJoCo"):
-            check_jax(on_cpu=isinstance(args, Export))  # an export refuses a GPU
-            setup_jax()
-            from hector_jax.cli import commands  # after the flags: `hector --help` answers at once
+            start_jax(on_cpu=isinstance(args, Export))  # an export refuses a GPU
+            with outside_packages():  # after the flags: `hector --help` answers at once
+                from hector_jax.cli import commands
     except InputError as error:
         if not isinstance(args, Doctor):
             raise

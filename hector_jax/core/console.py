@@ -1,6 +1,7 @@
 """Messages and progress on stderr, and the exit code of a program; stdout carries results only."""
 
 import errno
+import io
 import os
 import select
 import signal
@@ -21,7 +22,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from hector_jax.core.inputs import InputError, printable
+from hector_jax.core.inputs import InputError, check_utf8, outside_packages, printable
 
 console = Console(stderr=True, highlight=False)
 
@@ -151,13 +152,18 @@ def _stoppable(name: str) -> Iterator[None]:
 
 
 def _open_streams() -> None:
-    """Open /dev/null for closed standard streams; else the next file would take their number."""
+    """Open /dev/null for closed standard streams; else the next file would take their number.
+
+    What the encoding of the output lacks, such as a byte of a folder's name, is escaped.
+    """
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(number, True)
     os.close(number)
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             setattr(sys, name, open(number, "w" if number else "r", closefd=False))  # noqa: SIM115
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def _drop(stream: TextIO) -> None:
@@ -177,7 +183,9 @@ def exit_code(name: str, work: Callable[[], None]) -> int:
     """
     _open_streams()
     try:
-        with _stoppable(name):
+        for word in sys.argv[1:]:
+            check_utf8("names", word)  # they go into messages, tables and files
+        with _stoppable(name), outside_packages():
             try:
                 work()
             except SystemExit:  # from a parser that has printed its help

@@ -20,6 +20,7 @@ _NO_NUMBERS = (
     "control.weights_file core.console core.environment core.files core.identity core.inputs"
     " core.runtime core.tree_file"
 ).split()
+_NUMERICS = "core.numerics"  # JAX's options, on which all numbers depend
 # imported names whose package has another name or brings another package that computes
 _PACKAGES_OF = {
     "jax": ("jax", "jaxlib"),
@@ -83,15 +84,16 @@ def _commit(folder: Path) -> str:
 def code_hash(*modules: str) -> str:
     """Return a hash (12 hexadecimal digits) of the code and packages that determine a result.
 
-    It covers the syntax trees, without docstrings, of the modules and of every module of this
-    package that they import, and the versions of all other packages that these import. Comments,
-    layout and modules that only read, write and print do not change it.
+    It covers the syntax trees, without docstrings, of the modules, of every module of this package
+    that they import and of the one that sets JAX's options, and the versions of all other packages
+    that these import. Comments, layout and modules that only read, write and print do not change
+    it.
 
     Args:
         modules: names such as `sim.walk`, relative to this package.
     """
     trees: dict[str, str] = {}
-    pending, packages = list(modules), set[str]()
+    pending, packages = [_NUMERICS, *modules], set[str]()
     while pending:
         name = pending.pop()
         if name in trees or name in _NO_NUMBERS:

@@ -1,9 +1,15 @@
-"""Input errors, the wording of their messages, and files read as text."""
+"""Input errors, the wording of their messages, packages of others, and files read as text."""
 
 import difflib
-from collections.abc import Iterable
+import os
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from importlib.machinery import PathFinder
 from importlib.util import find_spec
 from pathlib import Path
+from traceback import walk_tb
+from types import ModuleType
 from typing import Any
 
 
@@ -19,6 +25,70 @@ def require_package(package: str, extra: str, what: str, hint: str = "") -> None
     """Raise an InputError unless the package of an extra, which `what` needs, is installed."""
     if find_spec(package) is None:
         raise InputError(f"{what} needs {package}: pip install 'hector-jax[{extra}]'{hint}")
+
+
+@contextmanager
+def outside_packages() -> Iterator[None]:
+    """Raise an InputError where a package of others cannot be loaded, as one of another Python.
+
+    A fault of our own modules keeps its exception.
+    """
+    try:
+        yield
+    except Exception as error:
+        if line := _broken_package(error):
+            raise InputError(line) from None
+        raise
+
+
+def _broken_package(error: Exception) -> str:
+    """Return the line about the package that cannot be loaded; "" if the error is another one."""
+    while isinstance(error, ImportError) and isinstance(error.__cause__, ImportError):
+        error = error.__cause__  # the first one says most
+    frames = [frame for frame, _ in walk_tb(error.__traceback__)]
+    modules = [_package(frame.f_globals.get("__name__", "")) for frame in frames]
+    named, last = "", modules[-1] if modules else ""
+    is_ours = last == _package(__name__) or not _file_of(last, sys.path[1:])
+    if isinstance(error, ImportError):
+        named = _package(error.name or "")
+    elif isinstance(error, AttributeError) and isinstance(error.obj, ModuleType):
+        named = _package(error.obj.__name__)
+    suspects = [named]
+    if not is_ours and any(frame.f_code.co_name == "<module>" for frame in frames):
+        suspects += [last, *sorted(map(_package, sys.modules))]  # one may break another
+    for package in suspects:
+        own, file = _file_of(package, _own_folders()), _file_of(package)
+        if own and file != own and package != _package(__name__):
+            folder = str(Path(file).parents[Path(file).name == "__init__.py"])
+            on_path = folder in _python_path()
+            remedy = f"take {folder} out of PYTHONPATH" if on_path else "rename it"
+            reason = f"{one_line(error)[:150]}; it hides {own}: {remedy}"
+            return f"{package} cannot be loaded from {file}: {reason}"
+    if not isinstance(error, ImportError) or (is_ours and _file_of(named)):
+        return ""
+    if is_ours:
+        return f"{named} is not installed: {one_line(error)}"
+    package = named if _file_of(named) else last
+    return f"{package} cannot be loaded from {_file_of(package)}: {one_line(error)}"
+
+
+def _package(module: str) -> str:
+    return module.partition(".")[0]
+
+
+def _python_path() -> list[str]:
+    return list(map(os.path.abspath, os.environ.get("PYTHONPATH", "").split(os.pathsep)))
+
+
+def _own_folders() -> list[str]:
+    """Return the folders of this Python's packages: neither of PYTHONPATH nor of the script."""
+    return [folder for folder in sys.path[1:] if os.path.abspath(folder) not in _python_path()]
+
+
+def _file_of(package: str, folders: list[str] | None = None) -> str:
+    """Return the file of a package in the first folder that has it, of sys.path by default."""
+    spec = PathFinder.find_spec(package, folders) if package else None
+    return (spec and spec.origin) or ""
 
 
 def did_you_mean(name: str, names: Iterable[str]) -> str:
@@ -55,6 +125,12 @@ def one_line(error: BaseException | str) -> str:
 def printable(text: str) -> str:
     """Return a text on one line; control characters, as in a file's name, become `?`."""
     return "".join(x if x.isprintable() else " " if x.isspace() else "?" for x in text)
+
+
+def check_utf8(what: str, name: str) -> None:
+    """Raise an InputError unless the name of a file or folder, as Python reads it, is UTF-8."""
+    if name != name.encode(errors="replace").decode():
+        raise InputError(f"{what} must be in UTF-8, got {name!r}")
 
 
 def plural(number: int, noun: str) -> str:

@@ -1,4 +1,4 @@
-"""Set-up of a process: 64 bits, the persistent compilation cache and worker processes.
+"""Set-up of a process: JAX's options, the persistent compilation cache and worker processes.
 
 The library itself leaves `jax.config` alone; programs (cli, experiments, benchmarks, tests, worker
 processes) call `setup_jax` once, before the first array.
@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from functools import cache
+from importlib import import_module
 from multiprocessing import active_children, parent_process
 from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.managers import SyncManager
@@ -24,9 +25,9 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-from hector_jax.core.inputs import InputError, one_line
+from hector_jax.core.inputs import InputError, check_utf8, one_line, outside_packages
+from hector_jax.core.numerics import pin_options
 
-_YNNPACK = "--xla_cpu_experimental_ynn_fusion_type"
 _LEAST_MEMORY = 3e9  # [B] of address space: JAX alone takes 1.3 GB, compiling a walk 2.3 GB
 
 
@@ -40,7 +41,7 @@ def cache_folder() -> Path:
     """Return the folder of the compilation cache; a temporary one if the home is not writable.
 
     Raises:
-        InputError: no folder exists that only this user can write.
+        InputError: no folder exists that only this user can write, or its name is not UTF-8.
     """
     folder = home_cache()
     try:
@@ -63,11 +64,12 @@ def cache_folder() -> Path:
             ) from None
         folder = own / "jax"
         folder.mkdir(exist_ok=True)
+    check_utf8("XDG_CACHE_HOME or the folder of the cache", str(folder))  # JAX takes no other name
     return folder
 
 
-def check_jax(on_cpu: bool = False) -> None:
-    """Check that JAX starts under the limits and variables of the environment.
+def start_jax(on_cpu: bool = False) -> None:
+    """Start JAX with the options of `setup_jax`, under the limits and variables of the environment.
 
     Args:
         on_cpu: compute on the CPU even if there are accelerators.
@@ -82,35 +84,27 @@ def check_jax(on_cpu: bool = False) -> None:
             f"{_LEAST_MEMORY / 1e9:g} GB"
         )
     flags = os.environ.get("XLA_FLAGS", "")
-    if flags and (fault := _fault_of_xla(flags)):
-        raise InputError(f"XLA_FLAGS={flags}: {fault}")
-    _without_ynnpack()
     variables = [f"{name}={os.environ[name]}" for name in sorted(os.environ) if name[:4] == "JAX_"]
     try:
-        import jax
+        with outside_packages():
+            import_module("numpy.linalg")  # first: where it is broken, jaxlib prints a traceback
+            import jax
 
-        if on_cpu:
-            jax.config.update("jax_platforms", "cpu")
-        jax.devices()
+            if flags and (fault := _fault_of_xla(flags)):
+                raise InputError(f"XLA_FLAGS={flags}: {fault}")
+            if on_cpu:
+                jax.config.update("jax_platforms", "cpu")
+            setup_jax()  # before the devices start, which read some options once
+            jax.devices()
+    except InputError:
+        raise
     except Exception as error:  # of several types, some without a message
         what = f"JAX does not start{' with ' if variables else ''}{', '.join(variables)}"
         raise InputError(f"{what}: {one_line(error) or 'no such device here'}") from None
-
-
-def _without_ynnpack() -> None:
-    """Turn off XLA's YNNPACK on the CPU; call before JAX starts, which reads XLA_FLAGS once.
-
-    Its sums read memory that nothing has written: with jaxlib 0.12 a third of the programs of the
-    plain net gave NaN, and 0.10.2 has wrong sums (jax-ml/jax issue 39103). An unknown flag ends a
-    process, so only the versions that are known to know it are given it.
-    """
-    from jaxlib.version import __version_info__ as version
-
-    flags = os.environ.get("XLA_FLAGS", "")
-    in_file = flags.strip()[:1] not in ("", "-")  # XLA_FLAGS can name a file of flags
-    if (0, 10, 2) <= version < (0, 13) and _YNNPACK not in flags and not in_file:
-        # first, because XLA ignores what follows a word without a dash
-        os.environ["XLA_FLAGS"] = f"{_YNNPACK}= {flags}".strip()
+    not_finite = jax.numpy.array([jax.numpy.nan, jax.numpy.inf])
+    see = jax.jit(lambda x: jax.numpy.isnan(x) | jax.numpy.isinf(x))
+    if flags and not see(not_finite).all():  # as with some flags of fast mathematics
+        raise InputError(f"XLA_FLAGS={flags}: programs would not see NaN and infinity")
 
 
 @cache
@@ -132,15 +126,14 @@ def _fault_of_xla(flags: str) -> str:
 
 
 def setup_jax() -> None:
-    """Turn on 64 bits, full precision and the compilation cache; call before the first array.
+    """Turn on 64 bits and the compilation cache; call before the first array.
 
-    CPU programs are dispatched synchronously, and Python's garbage collector runs less often.
+    All of JAX's options that could change numbers are pinned (`core.numerics`). CPU programs are
+    dispatched synchronously, and Python's garbage collector runs less often.
     """
     import jax
 
-    _without_ynnpack()
-    jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_default_matmul_precision", "highest")
+    pin_options()
     # Run a CPU program in the calling thread: waking another thread takes as long as the small
     # programs of a walk.
     jax.config.update("jax_cpu_enable_async_dispatch", False)

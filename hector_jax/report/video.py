@@ -9,7 +9,6 @@ and the run goes on without a film.
 
 import os
 import pickle
-import shutil
 import signal
 import subprocess
 import sys
@@ -24,6 +23,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.console import Broken
+from hector_jax.core.files import write_file
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, one_line
 from hector_jax.core.settings import AT_LEAST_ONE, Range, check, choose
@@ -163,7 +163,7 @@ def _write(scene: Scene, path: Path) -> str:
         for back_end in (setting,) if setting else BACK_ENDS:
             failure = _draw_in_child(folder, back_end)
             if not failure:
-                shutil.move(folder / scene.file, path)
+                write_file(path, (folder / scene.file).read_bytes())
                 return back_end
             failures.append(f"{back_end}: {failure}")
     raise VideoUnavailable(f"no film: MuJoCo cannot draw here ({'; '.join(failures)})")

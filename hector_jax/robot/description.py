@@ -20,8 +20,8 @@
     [tuning]                           # fields of TuningSettings
     [plants]                           # fields of PlantSizes
 
-Defaults are those of assets/hector.toml. Masses, lengths, joint and torque limits come from the
-model; a description is a static field of its `Robot` under jit.
+The model must be named; all other defaults are those of assets/hector.toml. Masses, lengths, joint
+and torque limits come from the model; a description is a static field of its `Robot` under jit.
 """
 
 import math
@@ -302,7 +302,7 @@ class _Weights:
 @dataclass(frozen=True)
 class _File:
     name: str | None = None
-    model: str = MODEL_PATH.name
+    model: str = ""
     standing: str | dict[str, float] = "standing"
     joints: _Joints = _Joints(left=_joint_names("left"), right=_joint_names("right"))
     feet: _Feet | None = None
@@ -326,6 +326,10 @@ class _File:
         angles = self.standing.values() if isinstance(self.standing, dict) else ()
         if not all(map(math.isfinite, angles)):
             raise InputError(f"standing must be finite angles, got {short_repr(self.standing)}")
+        if not self.model:
+            raise InputError(
+                "model is missing, the name of the robot's MJCF or URDF, beside this file"
+            )
         if Path(self.model).name != self.model:
             raise InputError(
                 f"model must be the name of a file beside it, got {short_repr(self.model)}"

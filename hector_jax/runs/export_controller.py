@@ -55,20 +55,49 @@ from hector_jax.sim.world import build_world, ideal, standing_qpos
 _STILL = Command(np.ones(2), np.zeros((2, 2)), np.zeros(2))
 
 
-def _idle(config: WalkConfig, robot: Robot, weights: Weights) -> tuple[Memory, Plan]:
-    """Return memory and plan of zeros with the shapes and dtypes of the real ones."""
+class _Heading(NamedTuple):
+    """Yaws that do not jump by whole turns, in the carry."""
+
+    yaw: Any  # the last measured one that is finite [rad]
+    anchor: Anchor  # the last one, as it was given
+    anchor_yaw: Any  # its yaw, next to the measured one [rad]
+
+
+def _idle(config: WalkConfig, robot: Robot, weights: Weights) -> tuple[_Heading, Memory, Plan]:
+    """Return a carry of zeros with the shapes and dtypes of real ones."""
     joints, feet = np.zeros_like(robot.standing_joints), len(robot.foot_point)
+    anchor = standing_anchor(robot)
     shapes = jax.eval_shape(
         partial(step_plan, config),
         robot,
         config.parameters(weights),
         command=_STILL,
-        anchor=standing_anchor(robot),
+        anchor=anchor,
         tick=np.int32(0),
         memory=Memory(Feet(np.zeros((feet, 3)), np.zeros(feet)), NO_DISTURBANCE),
         measurement=Measurement(State(*np.zeros((4, 3))), joints, joints),
     )
-    return jax.tree.map(lambda shape: np.zeros(shape.shape, shape.dtype), shapes)
+    carry = _Heading(anchor.yaw, anchor, anchor.yaw), *shapes
+    return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), carry)
+
+
+def _next_to(angle: Float[Array, ""], other: Float[Array, ""]) -> Float[Array, ""]:
+    """Return an angle [rad] plus the whole turns that bring it closest to another."""
+    return angle + 2 * jnp.pi * jnp.round((other - angle) / (2 * jnp.pi))
+
+
+def _unwrap(
+    last: _Heading, yaw: Float[Array, ""], anchor: Anchor
+) -> tuple[_Heading, Float[Array, ""]]:
+    """Return the next heading and the measured yaw [rad] next to the last one.
+
+    A new anchor's yaw is taken next to the measured one, as both may be of any turn.
+    """
+    yaw = _next_to(yaw, last.yaw)
+    seen = jnp.where(jnp.isfinite(yaw), yaw, last.yaw)
+    is_new = jnp.any(jnp.stack([jnp.any(x != y) for x, y in zip(anchor, last.anchor, strict=True)]))
+    anchor_yaw = jnp.where(is_new, _next_to(anchor.yaw, seen), last.anchor_yaw)
+    return _Heading(seen, anchor, anchor_yaw), yaw
 
 
 def controller(
@@ -95,9 +124,11 @@ def controller(
         anchor: dict[str, Array],
     ) -> tuple[tuple[Array, ...], dict[str, Array]]:
         tick, substep = begin + millisecond // count, millisecond % count
+        heading, memory, plan = jax.tree.unflatten(structure, carry)
+        heading, yaw = _unwrap(heading, measured["euler"][2], Anchor(**anchor))
         state = State(**{name: measured[name] for name in State._fields})
+        state = state._replace(euler=jnp.append(state.euler[:2], yaw))
         measurement = Measurement(state, measured["joints"], measured["joint_rates"])
-        memory, plan = jax.tree.unflatten(structure, carry)
 
         plan_tick = partial(
             step_plan,
@@ -105,7 +136,7 @@ def controller(
             robot,
             parameters,
             command=Command(**command),
-            anchor=Anchor(**anchor),
+            anchor=heading.anchor._replace(yaw=heading.anchor_yaw),
             tick=tick,
             memory=memory,
             measurement=measurement,
@@ -124,7 +155,7 @@ def controller(
             "status": plan.status,
             "residual": plan.residual,
         }
-        return tuple(jax.tree.leaves((memory, plan))), out
+        return tuple(jax.tree.leaves((heading, memory, plan))), out
 
     return control, (tuple(idle), np.int32(0), *_standing(robot))
 
@@ -148,7 +179,7 @@ _SIGNATURE = {
     "carry": "opaque: zeros at millisecond 0, then the carry that came out",
     "millisecond": "since the start; the robot stands on all feet then",
     "measured": {
-        "euler": "roll, pitch, yaw of the trunk [rad], R = Rz Ry Rx; yaw continuous, not wrapped",
+        "euler": "roll, pitch, yaw of the trunk [rad], R = Rz Ry Rx; the yaw of any turn",
         "position": "centre of mass [m], world: trunk origin + R com_offset; the floor is z = 0",
         "ang_velocity": "of the trunk, world frame [rad/s]",
         "velocity": "of the centre of mass, world frame [m/s]",
@@ -162,7 +193,7 @@ _SIGNATURE = {
     },
     "anchor": {
         "position": "where the reference starts [m]; z is standing_height",
-        "yaw": "[rad]",
+        "yaw": "[rad], of any turn",
         "tick": "when: gait tick from which on the command is walked; before, it steps in place",
     },
     "out": {

@@ -16,7 +16,7 @@ import jax
 
 from hector_jax.control.controller import WalkConfig
 from hector_jax.core.identity import function_id
-from hector_jax.core.inputs import InputError
+from hector_jax.core.inputs import InputError, outside_packages
 from hector_jax.core.settings import choose
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.robot.model import Robot
@@ -135,7 +135,7 @@ def choose_engine(name: str) -> Engine:
     """Return the engine of a name; `auto` is MJX if JAX has an accelerator, else MuJoCo C.
 
     Raises:
-        InputError: no such engine, or its package is not installed.
+        InputError: no such engine, or its package is not installed or cannot be loaded.
     """
     if choose("engine", name, ("auto", *ENGINES)) == "auto":
         return MUJOCO_C if jax.default_backend() == "cpu" else MJX
@@ -145,4 +145,6 @@ def choose_engine(name: str) -> Engine:
             f"engine {name} needs {engine.package}, which is not installed: "
             f"pip install 'hector-jax[{name}]'"
         )
+    with outside_packages(), redirect_stdout(sys.stderr):  # MJX prints which packages are missing
+        import_module(f"hector_jax.{engine.modules[-1]}")
     return engine

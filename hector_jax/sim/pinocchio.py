@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float
 
+from hector_jax.core.inputs import InputError
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 from hector_jax.sim import bodies
@@ -20,6 +21,11 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.plant import LEGS, OTHER, Plant, PointContacts, lasting_world
 from hector_jax.sim.sensing import Ground
 from hector_jax.sim.world import STOP_TIME, World, standing_qpos
+
+if not hasattr(pin, "ADMMConstraintSolver"):  # PyPI has a `pinocchio` of other people
+    raise InputError(
+        f"Pinocchio (pip install 'pin>=4.1') is expected, {pin.__file__} is another one"
+    )
 
 _NEAR = 1e-3  # [m] height above the floor below which a point may touch within the step
 _BEND = 0.1  # share of the backlash by which the largest torque bends the gear's teeth

@@ -1,5 +1,6 @@
 """Style of all pictures: figure and legend, axes, and line and marker of each weight set."""
 
+import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import cycle
@@ -11,6 +12,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
+
+from hector_jax.core.files import write_file
 
 T = TypeVar("T")
 
@@ -132,7 +135,10 @@ def drawing(
         # without date or version, so that the same picture has the same bytes
         fields = {".png": "Software", ".svg": "Date", ".pdf": "CreationDate"}
         field = fields.get(path.suffix.lower())
-        figure.savefig(path, metadata={field: None} if field else None)
+        content = io.BytesIO()
+        metadata = {field: None} if field else None
+        figure.savefig(content, format=path.suffix[1:], metadata=metadata)
+    write_file(path, content.getvalue())
 
 
 def widen(axes: Axes, least: float) -> None:

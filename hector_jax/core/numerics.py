@@ -1,0 +1,91 @@
+"""JAX's options on which numbers depend or by which programs break: ours while a program runs.
+
+`PINNED` gets values of ours, whoever set it before. Any other option that the environment sets goes
+back to JAX's default, whether this module knows it or not, except those in `_FREE`. Where compiled
+programs are kept is up to `core.runtime`.
+"""
+
+import os
+import pickle
+import subprocess
+import sys
+from functools import cache
+from typing import Any
+
+PINNED = {
+    "jax_enable_x64": True,  # the QP mixes weights of 1e2 and 1e-5
+    "jax_default_matmul_precision": "highest",  # else a GPU rounds numbers of 32 bits before
+    # one seed gives one net, one data set and one plant
+    "jax_default_prng_impl": "threefry2x32",
+    "jax_random_seed_offset": 0,
+    "jax_threefry_partitionable": True,
+    # shapes and dtypes mix as in NumPy, and NumPy's arrays go into compiled programs
+    "jax_numpy_rank_promotion": "allow",
+    "jax_numpy_dtype_promotion": "standard",
+    "jax_transfer_guard": None,
+    "jax_disable_jit": False,  # a walk would take hours
+    # NaN and infinity are data: a walk that fell, a bound that is none
+    "jax_debug_nans": False,
+    "jax_debug_infs": False,
+}
+# beginnings of the names of options that are the user's
+_FREE = tuple(
+    (
+        # devices; not jax_default_device: programs ask for the default backend and compute there
+        "jax_platform jax_backend_target jax_xla_backend jax_num_cpu_devices jax_pjrt_"
+        " jax_cuda_visible jax_rocm_visible jax_oneapi_visible jax_mock_gpu"
+        # hosts
+        " jax_distributed jax_mtls jax_check_proxy jax_cpu_collectives jax_cpu_get_"
+        " jax_cross_host jax_force_dcn jax_share_binary jax_sort_devices"
+        " jax_enable_preemption jax_enable_recoverability"
+        # whether and how many compiled programs are kept
+        " jax_enable_compilation_cache jax_compilation_cache_max_size"
+        # logs, dumps and tracebacks
+        " jax_log jax_debug_log jax_explain jax_captured_constants jax_pallas_verbose"
+        " jax_compiler_detailed_logging jax_dump jax_include jax_source_url jax_pprint"
+        " jax_traceback jax_tracer_error jax_send_traceback jax_hlo_source"
+    ).split()
+)
+_YNNPACK = "--xla_cpu_experimental_ynn_fusion_type"
+
+
+def pin_options() -> None:
+    """Give JAX's options the values that programs are made for; call before the first array."""
+    import jax
+
+    without_ynnpack()
+    values = (_defaults() if not_used() else {}) | PINNED
+    for name in jax.config.values:  # which differ between versions
+        if name in PINNED or name.upper() in not_used():
+            jax.config.update(name, values[name])
+
+
+@cache  # the environment sets JAX's options once, when JAX is imported
+def not_used() -> dict[str, str]:
+    """Take the variables that set an option of ours out of the environment, and return them."""
+    import jax
+
+    ours = {name.upper() for name in jax.config.values if not name.startswith(_FREE)}
+    return {name: os.environ.pop(name) for name in sorted(ours & os.environ.keys())}
+
+
+def _defaults() -> dict[str, Any]:
+    """Return JAX's defaults, which only a process without the variables knows."""
+    program = "import pickle, sys, jax; sys.stdout.buffer.write(pickle.dumps(jax.config.values))"
+    return pickle.loads(subprocess.check_output([sys.executable, "-c", program]))
+
+
+def without_ynnpack() -> None:
+    """Turn off XLA's YNNPACK on the CPU; call before JAX starts, which reads XLA_FLAGS once.
+
+    Its sums read memory that nothing has written: with jaxlib 0.12 a third of the programs of the
+    plain net gave NaN, and 0.10.2 has wrong sums (jax-ml/jax issue 39103). An unknown flag ends a
+    process, so only the versions that are known to know it are given it.
+    """
+    from jaxlib.version import __version_info__ as version
+
+    flags = os.environ.get("XLA_FLAGS", "")
+    in_file = flags.strip()[:1] not in ("", "-")  # XLA_FLAGS can name a file of flags
+    if (0, 10, 2) <= version < (0, 13) and _YNNPACK not in flags and not in_file:
+        # first, because XLA ignores what follows a word without a dash
+        os.environ["XLA_FLAGS"] = f"{_YNNPACK}= {flags}".strip()
