@@ -4,6 +4,7 @@ A point stands for a weight set: steps of log-weights and of other numbers, in t
 model (`search.few_walks.Space`).
 """
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -62,6 +63,16 @@ class Campaign:
     def seconds(self) -> float:
         """Length of a walk."""
         return self.config.rollout.ticks * self.config.rollout.walk.gait.tick
+
+
+def walker_hash(robot: Robot) -> str:
+    """Return a hash (16 hexadecimal digits) of what of a robot's files makes a walk.
+
+    What only begins or judges one may change: weights, loss, limits of a fall, plants.
+    """
+    d = robot.description
+    parts = d.standing, d.joints, d.linkage, d.weld, d.armature, d.feet, d.control
+    return hashlib.sha256(repr(parts).encode() + d.model.read_bytes()).hexdigest()[:16]
 
 
 def with_leg_numbers(walk: WalkConfig, start: Weights, names: Sequence[str]) -> Weights:

@@ -9,11 +9,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hector_jax.control.reference import Command, anchor_at, reference_at
+from hector_jax.control.weights import Weights
 from hector_jax.core.inputs import InputError, one_line
 from hector_jax.core.trajectory import SOLVED, State, Trajectory, Wrench, has_fallen, no_samples
-from hector_jax.core.tree_file import named_leaves
+from hector_jax.core.tree_file import named_leaves, tree_hash
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
+from hector_jax.runs.campaign import walker_hash
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import loss_of
 
@@ -102,6 +104,14 @@ def _on_samples(log: Log, rows: Any) -> Log:
 def _references(tick: float, robot: Robot, command: Command, initial: State, ticks: Any) -> State:
     anchor = anchor_at(robot, initial, 0)
     return jax.vmap(lambda t: reference_at(tick, command, anchor, t))(ticks)
+
+
+def walk_card(
+    name: str, command: Command, weights: Weights, robot: Robot, seconds: float
+) -> dict[str, Any]:
+    """Return what identifies a walk, as JSON values: the entry `walk` in the card of its log."""
+    hashes = {"command": tree_hash(command), "weights": tree_hash(weights)}
+    return {"trajectory": name, **hashes, "robot": walker_hash(robot), "seconds": round(seconds, 3)}
 
 
 def trajectory_of(log: Log, period: float) -> Trajectory:
