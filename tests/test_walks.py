@@ -26,7 +26,7 @@ from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import save_tree
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import campaign as campaigns
-from hector_jax.runs import walk_log, walks
+from hector_jax.runs import reported_walks, walk_log, walks
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Tuned
 from hector_jax.sim.engine import ENGINES, MUJOCO_C
@@ -92,10 +92,10 @@ def test_eight_walks_through_files_equal_eight_in_process_to_the_last_bit(
     one, (_, _, rows) = campaign(tmp_path, robot), in_process
     space, again = walks.space_of(pool, one), []
     for number in range(WALKS):
-        again = walks.read_history(one)  # as a new process would
+        again = reported_walks.read_reports(pool, one)  # as a new process would
         proposal, weights = walks.next_proposal(pool, one, space, again)
-        log = walk_log.read_log(walked(robot, weights, tmp_path / f"{number}.npz"), robot, SECONDS)
-        again = walks.add_walk(one, again, proposal, walks.evaluate_logs(pool, one, [log]))
+        log = walked(robot, weights, tmp_path / f"{number}.npz")
+        again = reported_walks.add_report(pool, one, proposal, [log])
     assert len(again) == len(rows) == WALKS
     for mine, theirs in zip(again, rows, strict=True):
         np.testing.assert_array_equal(mine.point, theirs.point)
@@ -328,7 +328,7 @@ def test_the_points_of_a_folder_stay_in_one_metric(monkeypatch, pool, in_process
     monkeypatch.setattr(walks.tunings, "gauss_newton_job", None)
     space = walks.space_of(pool, one)
     again = campaigns.weights_at(one, space, rows[-1].point)
-    kept = load_weights(walks.weights_path(one, len(rows) - 1), one.robot)
+    kept = load_weights(walks.weights_path(one.folder, len(rows) - 1), one.robot)
     jax.tree.map(np.testing.assert_array_equal, again, kept)
 
 
@@ -347,7 +347,7 @@ def test_from_proposal_to_report_by_the_commands(monkeypatch, robot, pool, tmp_p
     assert (first["walk"], first["proposed_by"]) == (0, "start")
     with pytest.raises(InputError, match="begun with --traj short.toml, got s"):
         propose.propose(Propose(folder, ("s",)))
-    log = walked(robot, load_weights(Path(first["weights"]), robot), tmp_path / "log.npz")
+    log = str(walked(robot, load_weights(Path(first["weights"]), robot), tmp_path / "log.npz"))
     with pytest.raises(InputError, match="a log of each of short, got 2 files"):
         propose.report(Report(folder, (log, log)))
     propose.report(Report(folder, (log,), processes=1, json=True))

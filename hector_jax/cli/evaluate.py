@@ -32,6 +32,7 @@ from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import metrics, nets, tunings, verdicts
 from hector_jax.runs.setup import Setup
+from hector_jax.runs.walk_log import walk_card
 from hector_jax.sim.diagnosis import StartupFall, startup_fall
 from hector_jax.sim.engine import MUJOCO_C, choose_engine
 from hector_jax.sim.loop import Job
@@ -88,8 +89,7 @@ def walk(args: Walk) -> None:
         raise InputError("--plant needs a world of MuJoCo, got --world srbm")
     if args.world == "srbm" and args.engine != "c":
         raise InputError(f"--engine {args.engine} needs a world with a plant, got --world srbm")
-    engine = choose_engine(args.engine)
-    weights = arguments.weights(args.weights, robot)
+    engine, weights = choose_engine(args.engine), arguments.weights(args.weights, robot)
     command = arguments.load_trajectory(args.traj, robot)
     loss, config = loss_of_robot(robot.description), walk_config(robot)
     say("compiling (only the first time on a machine) and walking")
@@ -105,7 +105,9 @@ def walk(args: Walk) -> None:
     residuals = np.asarray(trajectory.residual)[::samples]
     unsolved = int(np.sum(~(residuals <= SOLVED)))
     if args.out is not None:
-        save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=as_table(args))
+        seconds = arguments.walk_seconds(args, command)
+        about = as_table(args) | {"walk": walk_card(*command[:2], weights, robot, seconds)}
+        save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=about)
     where = args.world + ("" if engine is MUJOCO_C else f" in engine {engine.name}")
     where += "" if plant is None else f" on {plant.description.name}"
     title = f"{command.name} in {where}, {printable(args.weights)} weights"
@@ -125,8 +127,7 @@ def walk(args: Walk) -> None:
     if unsolved:
         raise Broken(
             f"{unsolved} of {plural(len(residuals), 'QP')} were not solved (largest relative "
-            f"residual {float(score.residual):.0e}, expected at most {SOLVED:.0e}): this walk is "
-            "no result"
+            f"residual {score.residual:.0e}, expected at most {SOLVED:.0e}): this walk is no result"
         )
     if args.video is not None:
         name = Path(args.weights).stem

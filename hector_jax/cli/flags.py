@@ -19,6 +19,7 @@ class Source(Enum):
     """What a flag names; its existence is checked before the slow imports."""
 
     FILE = "a file"
+    LOG = "a file or NAME=FILE"
     RUN = "the folder of a run of `hector tune`"
     FOLDER = "a folder"  # may not exist yet
     EXPORTABLE = "a run folder or a weights file"
@@ -203,7 +204,9 @@ class Report(Flags):
     """
 
     folder: Folder  # of `hector propose`
-    logs: tuple[Annotated[Path, Source.FILE], ...]  # one of each trajectory (docs/howto/walks.md)
+    # one of each trajectory, in their order or as NAME=FILE (docs/howto/walks.md)
+    logs: tuple[Annotated[str, Source.LOG], ...]
+    undo: bool = False  # take no logs, but take back the last report: its walk is waited for again
     processes: Processes = 2  # worker processes, one core each
     json: bool = False  # print JSON instead of text
 

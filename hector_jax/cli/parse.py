@@ -207,7 +207,7 @@ def check(flags: Any) -> None:
     for field in fields(flags):
         value, label = getattr(flags, field.name), _label(field)
         convert(value, field.type, name=label)
-        if value == () != field.default:
+        if value == () != field.default and not getattr(flags, "undo", False):
             raise InputError(f"{label} expects a value, got none")
         items = value if isinstance(value, tuple) else (value,)
         for i, item in enumerate(items):
@@ -239,10 +239,13 @@ def _check_source(label: str, value: Path | str, source: Source) -> None:
     text = str(value)
     if source is Source.SETS:
         text = str(Path(text.rpartition("=")[2]))  # without NAME=
+    if source is Source.LOG:
+        text = text.split("=", 1)[-1]
     path, named, is_dir = Path(text), text in NAMED_WEIGHTS, os.path.isdir(text)
     existing = next(x for x in (path, *path.parents) if os.path.exists(x))
     valid, is_file = {
         Source.FILE: (True, True),
+        Source.LOG: (True, True),
         Source.RUN: (is_dir, False),
         Source.FOLDER: (os.path.isdir(existing), False),
         Source.EXPORTABLE: (True, not is_dir),

@@ -1,6 +1,9 @@
 """`hector propose` and `hector report`: tune on walks of a real robot or another simulator."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -10,11 +13,13 @@ from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import Propose, Report
 from hector_jax.cli.parse import as_table, from_file
 from hector_jax.control.parameters import leg_numbers, model_numbers
+from hector_jax.control.weights_file import load_weights
+from hector_jax.core.console import say
 from hector_jax.core.files import locked, make_folder, write_json
-from hector_jax.core.inputs import InputError, plural
+from hector_jax.core.inputs import InputError, plural, unknown
 from hector_jax.core.runtime import workers
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import tunings, walk_log, walks
+from hector_jax.runs import reported_walks, tunings, walk_log, walks
 from hector_jax.runs.campaign import Campaign
 from hector_jax.runs.folder import CONFIG
 
@@ -28,12 +33,12 @@ def propose(args: Propose) -> None:
     campaign = _campaign(args)
     make_folder(args.folder)
     with locked(args.folder), workers(args.processes) as pool:
-        rows, space = walks.read_history(campaign), walks.space_of(pool, campaign)
+        rows, space = reported_walks.read_reports(pool, campaign), walks.space_of(pool, campaign)
         proposal, _ = walks.next_proposal(pool, campaign, space, rows)
         if not path.exists():  # last, so that rejected flags can be corrected
             write_json(path, {"flags": as_table(args)})
     number = len(rows)
-    weights = walks.weights_path(campaign, number)
+    weights = walks.weights_path(args.folder, number)
     result = {"walk": number, "weights": str(weights), "proposed_by": proposal.method}
 
     def print_text() -> None:
@@ -47,32 +52,92 @@ def propose(args: Propose) -> None:
 
 
 def report(args: Report) -> None:
-    """Read the logs of the walks with the proposed weights, and evaluate them."""
+    """Read the logs of the walks with the proposed weights and evaluate them, or undo that."""
     path = args.folder / CONFIG
     if not path.exists():
         raise InputError(f"{args.folder}: nothing was proposed here; begin with hector propose")
     campaign = _campaign(replace(from_file(Propose, path), folder=args.folder))
-    if len(args.logs) != len(campaign.commands):
-        expected = f"a log of each of {', '.join(campaign.commands)}"
-        raise InputError(f"LOGS must be {expected}, got {plural(len(args.logs), 'file')}")
+    if args.undo:
+        _undo(args, campaign)
+        return
+    files = _files(args.logs, list(campaign.commands))
     with locked(args.folder), workers(args.processes) as pool:
-        rows, space = walks.read_history(campaign), walks.space_of(pool, campaign)
-        proposal = walks.pending(campaign, rows)
-        if proposal is None:
+        number = len(walks.read_history(campaign))
+        if (proposal := walks.pending(campaign, number)) is None:
             raise InputError(f"{args.folder}: no walk is waited for; begin with hector propose")
-        logs = [walk_log.read_log(path, campaign.robot, campaign.seconds) for path in args.logs]
-        rows = walks.add_walk(campaign, rows, proposal, walks.evaluate_logs(pool, campaign, logs))
-        _, best_number = walks.answer(campaign, space, rows)
-    number, changes = len(rows) - 1, walks.changes(rows)
+        tracked = _check_logs(args, campaign, number, files)
+        rows = reported_walks.add_report(pool, campaign, proposal, list(files.values()))
+        _, best_number = walks.answer(campaign, walks.space_of(pool, campaign), rows)
+    changes = walks.changes(rows)
     last, best = _text(changes[-1]), _text(changes[best_number])
-    weights = walks.weights_path(campaign, best_number)
+    weights = walks.weights_path(args.folder, best_number)
     result = {"walk": number, **changes[-1]._asdict(), "best": best_number, "weights": str(weights)}
 
     def print_text() -> None:
         print(f"walk {number}: {last}; best is walk {best_number}, {best}")
         print(f"its weights: {weights}; the next ones: hector propose {args.folder}")
 
-    print_result(args.json, result, print_text)
+    print_result(args.json, result | {"logs": tracked}, print_text)
+
+
+def _undo(args: Report, campaign: Campaign) -> None:
+    if args.logs:
+        raise InputError(f"--undo takes no LOGS, got {plural(len(args.logs), 'file')}")
+    with locked(args.folder):
+        number, paths = reported_walks.undo_report(campaign)
+    weights, logs = str(walks.weights_path(args.folder, number)), [str(path) for path in paths]
+    text = f"walk {number} is to be walked again, with {weights}; its logs: {' '.join(logs)}"
+    result = {"walk": number, "weights": weights, "logs": logs}
+    print_result(args.json, result, lambda: print(text))
+
+
+def _files(texts: Sequence[str], names: Sequence[str]) -> dict[str, Path]:
+    """Return the log of each trajectory, one by one, from LOGS; else raise an InputError."""
+    named: dict[str, Path] = {}
+    for name, file in (text.split("=", 1) for text in texts if "=" in text):
+        if name not in names:
+            raise InputError(f"LOGS: {unknown('trajectory', name, names)}")
+        if name in named:
+            raise InputError(f"LOGS has two files for {name}: {named[name]} and {file}")
+        named[name] = Path(file)
+    others = [name for name in names if name not in named]
+    plain = [Path(text) for text in texts if "=" not in text]
+    if len(plain) != len(others):
+        expected = f"a log of each of {', '.join(names)}"
+        raise InputError(f"LOGS must be {expected}, got {plural(len(texts), 'file')}")
+    files = named | dict(zip(others, plain, strict=True))
+    return {name: files[name] for name in names}
+
+
+def _check_logs(
+    args: Report, campaign: Campaign, number: int, files: Mapping[str, Path]
+) -> dict[str, dict[str, Any]]:
+    """Show how the logs track, and refuse those of other walks; returns `walk_log.tracking`."""
+    robot, path = campaign.robot, walks.weights_path(args.folder, number)
+    walked = load_weights(path, robot), robot, campaign.seconds
+    proposed = {n: walk_log.walk_card(n, x, *walked) for n, x in campaign.commands.items()}
+    result = {}
+    for name, file in files.items():
+        log = walk_log.read_log(file, robot, campaign.seconds)
+        inputs = campaign.config, robot
+        tracked = {n: walk_log.tracking(*inputs, x, log) for n, x in campaign.commands.items()}
+        result[name] = tracked[name]
+        say(f"{file}: {name}; {_tracking_text(result[name])}")
+        named = any(text.startswith(f"{name}=") for text in args.logs)
+        if not walk_log.check_card(file, name, proposed, path) and not named:
+            walk_log.check_fit(file, name, tracked)
+    return result
+
+
+def _tracking_text(tracked: Mapping[str, Any]) -> str:
+    x, y, z = 100.0 * np.array(tracked["rms_position"])
+    errors = "roll {:.1f}, pitch {:.1f}, yaw {:.1f}".format(*np.degrees(tracked["rms_euler"]))
+    start = "x {:.2f}, y {:.2f}, height {:.2f} m".format(*tracked["initial_position"])
+    end = f"{'fell after' if tracked['fell'] else 'walked'} {tracked['seconds']:g} s"
+    return (
+        f"RMS error {np.hypot(x, y):.1f} cm horizontally, {z:.1f} cm in height, {errors} degrees; "
+        f"from {start}, yaw {np.degrees(tracked['initial_yaw']):.0f} degrees; {end}"
+    )
 
 
 def _text(change: walks.Change) -> str:
@@ -89,7 +154,9 @@ def _campaign(args: Propose) -> Campaign:
     trajectories = arguments.load_trajectories(args.traj, robot)
     config = tunings.tune_config(robot, others=model_numbers(args.tune))
     config = arguments.with_length(config, trajectories[0])
-    start = arguments.weights(args.start, robot)
+    begun = (args.folder / CONFIG).exists()  # from weights that --start may no longer name
+    start = str(walks.weights_path(args.folder, 0)) if begun else args.start
+    start = arguments.weights(start, robot)
     commands = {trajectory.name: trajectory.command for trajectory in trajectories}
     inputs = args.folder, config, robot, start, commands
     return Campaign(*inputs, seed=args.seed, leg_numbers=leg_numbers(args.tune))

@@ -4,6 +4,7 @@ A point stands for a weight set: steps of log-weights and of other numbers, in t
 model (`search.few_walks.Space`).
 """
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -59,9 +60,24 @@ class Campaign:
         return list(product(self.plants, self.commands.values()))
 
     @property
+    def reported(self) -> bool:
+        """True if the walks are made elsewhere and their logs reported."""
+        return all(plant is None for plant in self.plants)
+
+    @property
     def seconds(self) -> float:
         """Length of a walk."""
         return self.config.rollout.ticks * self.config.rollout.walk.gait.tick
+
+
+def walker_hash(robot: Robot) -> str:
+    """Return a hash (16 hexadecimal digits) of what of a robot's files makes a walk.
+
+    What only begins or judges one may change: weights, loss, limits of a fall, plants.
+    """
+    d = robot.description
+    parts = d.standing, d.joints, d.linkage, d.weld, d.armature, d.feet, d.control
+    return hashlib.sha256(repr(parts).encode() + d.model.read_bytes()).hexdigest()[:16]
 
 
 def with_leg_numbers(walk: WalkConfig, start: Weights, names: Sequence[str]) -> Weights:
@@ -104,6 +120,17 @@ def weights_at(campaign: Campaign, space: Space, point: Float[np.ndarray, " n"])
         value = start + step.reshape(np.shape(start)) * _unit(campaign, name)
         others[name] = np.clip(value, tunable.lower, tunable.upper)
     return project(campaign.start, of_weights)._replace(others=others)
+
+
+def point_of(campaign: Campaign, space: Space, weights: Weights) -> Float[np.ndarray, " n"]:
+    """Return the point of weights: the inverse of `weights_at` in the box."""
+    before, after = (np.asarray(weights_to_vector(w)) for w in (campaign.start, weights))
+    first_foot = directions(campaign.start).argmax(axis=1)  # index of each direction's first weight
+    steps = [np.log(after / before)[first_foot]]
+    for name in campaign.numbers:
+        change = weights.others[name] - campaign.start.others[name]
+        steps.append(np.ravel(change / _unit(campaign, name)))
+    return space.to_point @ np.concatenate(steps)
 
 
 def slope_of(

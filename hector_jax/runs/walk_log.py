@@ -1,5 +1,6 @@
-"""Logs of walks of this simulator or of a robot: their entries, loading and loss."""
+"""Logs of walks of this simulator or of a robot: their entries, loading, card and loss."""
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,11 +10,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hector_jax.control.reference import Command, anchor_at, reference_at
+from hector_jax.control.weights import Weights
 from hector_jax.core.inputs import InputError, one_line
+from hector_jax.core.settings import convert
 from hector_jax.core.trajectory import SOLVED, State, Trajectory, Wrench, has_fallen, no_samples
-from hector_jax.core.tree_file import named_leaves
+from hector_jax.core.tree_file import named_leaves, read_card, tree_hash
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
+from hector_jax.runs.campaign import walker_hash
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import loss_of
 
@@ -104,10 +108,87 @@ def _references(tick: float, robot: Robot, command: Command, initial: State, tic
     return jax.vmap(lambda t: reference_at(tick, command, anchor, t))(ticks)
 
 
+def walk_card(
+    name: str, command: Command, weights: Weights, robot: Robot, seconds: float
+) -> dict[str, Any]:
+    """Return what identifies a walk, as JSON values: the entry `walk` in the card of its log."""
+    hashes = {"command": tree_hash(command), "weights": tree_hash(weights)}
+    return {"trajectory": name, **hashes, "robot": walker_hash(robot), "seconds": round(seconds, 3)}
+
+
+def check_card(
+    path: Path, name: str, proposed: Mapping[str, Mapping[str, Any]], weights: Path
+) -> bool:
+    """Return whether a log that `read_log` reads has a card, which must be as it was proposed.
+
+    Args:
+        path, name: the log and its trajectory.
+        proposed, weights: the `walk_card` of each trajectory, and the file of the weights in it.
+
+    Raises:
+        InputError: one line naming the log: its card is damaged, or of another walk.
+    """
+    with np.load(path, allow_pickle=False) as archive:
+        about = read_card(path, "trajectory")["about"] if "card" in archive.files else {}
+    if (card := convert(about.get("walk"), dict | None, name=f"{path}: card.about.walk")) is None:
+        return False
+    other, own, order = card.get("trajectory"), proposed[name], ", ".join(proposed)
+    walk = f"{name} with another command" if other == name else one_line(str(other))
+    reasons = {
+        "command": f"a walk of {walk}, expected {name}; logs in the order {order}, or NAME=FILE",
+        "weights": f"a walk with other weights than the proposed ones, {weights}",
+        "robot": "a walk of another robot, or with another gait or controller",
+        "seconds": f"a walk of {card.get('seconds')} s, expected {own['seconds']} s",
+    }
+    if differs := [key for key in reasons if card.get(key) != own[key]]:
+        raise InputError(f"{path}: {reasons[differs[0]]}")
+    return True
+
+
+def check_fit(path: Path, name: str, tracked: Mapping[str, Mapping[str, Any]]) -> None:
+    """Raise an InputError if a log tracks another trajectory twice as well as its own.
+
+    `tracked` is the result of `tracking` for each trajectory. A walk that fell is not judged.
+    """
+    cm = {n: 100.0 * np.hypot(*errors["rms_position"][:2]) for n, errors in tracked.items()}
+    best = min(cm, key=lambda n: cm[n])
+    if not tracked[name]["fell"] and cm[best] < 0.5 * cm[name]:
+        raise InputError(
+            f"{path}: fits {best} (horizontal error {cm[best]:.1f} cm), expected {name} "
+            f"({cm[name]:.1f} cm); logs in the order {', '.join(cm)}, or {name}={path} to insist"
+        )
+
+
 def trajectory_of(log: Log, period: float) -> Trajectory:
     """Return the trajectory of a log sampled every `period` [s]; entries not in a log are empty."""
     empty = no_samples(log.joints.shape[1], log.command.force.shape[1])
     return empty._replace(period=np.asarray(period), **log._asdict())
+
+
+def _reference_of(config: TuneConfig, robot: Robot, command: Command, log: Log) -> State:
+    tick = config.rollout.walk.gait.tick
+    ticks = (np.arange(len(log.fallen)) + 1.0) / round(tick / TIME_STEP)
+    return _references(tick, robot, command, log.initial, ticks)
+
+
+def tracking(config: TuneConfig, robot: Robot, command: Command, log: Log) -> dict[str, Any]:
+    """Return how a log of 1 ms tracks a command, as JSON values in SI units.
+
+    RMS errors and `seconds` are up to a fall, of one sample at least.
+    """
+    count, reference = max(np.sum(~log.fallen), 1), _reference_of(config, robot, command, log)
+    euler, position = (
+        np.sqrt(np.mean((np.asarray(x) - y)[:count] ** 2, axis=0)).tolist()
+        for x, y in zip(log.state[:2], reference[:2], strict=True)
+    )
+    return {
+        "rms_position": position,  # x, y, z
+        "rms_euler": euler,  # roll, pitch, yaw
+        "initial_position": log.initial.position.tolist(),
+        "initial_yaw": float(log.initial.euler[2]),
+        "seconds": float(count * TIME_STEP),
+        "fell": bool(log.fallen.any()),
+    }
 
 
 def evaluate_log(config: TuneConfig, robot: Robot, command: Command, log: Log) -> ScoredLog:
@@ -115,10 +196,8 @@ def evaluate_log(config: TuneConfig, robot: Robot, command: Command, log: Log) -
 
     Source: Eq. 11.
     """
-    tick = config.rollout.walk.gait.tick
-    stride = round(tick / TIME_STEP)
-    ticks = (np.arange(len(log.fallen)) + 1.0) / stride
-    reference = _references(tick, robot, command, log.initial, ticks)
+    stride = round(config.rollout.walk.gait.tick / TIME_STEP)
+    reference = _reference_of(config, robot, command, log)
     loss = float(loss_of(config.loss, trajectory_of(log, TIME_STEP)._replace(reference=reference)))
     min_height, max_tilt = robot.description.limits
     upright = ~log.fallen

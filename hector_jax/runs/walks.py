@@ -5,8 +5,8 @@ same functions read the logs and make the proposals (search/few_walks.py), and a
 in the folder:
 
 - `walks.jsonl`: settings, then a line for each proposal that was walked.
-- `logs/3-0.npz`: the log of walk 3 in case 0, at the plan interval.
-- `proposal.json`: the proposal whose walk is not yet reported.
+- `logs/3-0.npz`: the log of walk 3 in case 0, at the plan interval, or the file that was reported.
+- `weights/3.json`, `proposals/3.json`: the weights of walk 3, and how they were proposed.
 - `metric.npz`: the Gauss-Newton matrix at the start, which defines the coordinates of all points.
 
 A weight set is walked in each case: all commands, on each plant. Its loss is the mean over the
@@ -36,8 +36,8 @@ from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
 from hector_jax.grfm import network
 from hector_jax.runs import tunings
 from hector_jax.runs.cache import content_key, robot_hash
-from hector_jax.runs.campaign import Campaign, box_of, slope_of, weights_at
-from hector_jax.runs.walk_log import Log, ScoredLog, evaluate_log, log_of, trajectory_of
+from hector_jax.runs.campaign import Campaign, box_of, slope_of, walker_hash, weights_at
+from hector_jax.runs.walk_log import Log, ScoredLog, evaluate_log, log_of, read_log, trajectory_of
 from hector_jax.search import few_walks
 from hector_jax.search.cmaes import add_row, read_journal
 from hector_jax.search.few_walks import Model, Proposal, Space, WalkResult
@@ -47,7 +47,7 @@ from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.grounded import Grounding, evaluate_grounded, fit_grounding
 from hector_jax.tuning.status import StepStatus
 
-_PROPOSAL = "proposal.json"
+RECORD = "walks.jsonl"
 _REFUSED = 20.0  # log-loss of weights with which the model falls or has an unsolved QP
 
 
@@ -97,6 +97,12 @@ def _evaluate_job(
     return jax.device_get(evaluate_grounded(*inputs, grounding, campaign.config.loss))
 
 
+def row_of(proposal: Proposal, cases: Sequence[ScoredLog]) -> Row:
+    """Return the row of a proposal and the scores of its walks."""
+    losses = np.array([score.loss for score, _ in cases])
+    return Row(*proposal, losses, max(score.margin for score, _ in cases))
+
+
 # The folder
 
 
@@ -106,18 +112,22 @@ def space_of(pool: Executor, campaign: Campaign) -> Space:
     Raises:
         InputError: the file of the matrix is damaged, or of another robot.
     """
+    # reported walks are of the robot's files, however this code reads them: see `walker_hash`
+    robot = None if campaign.reported else campaign.robot
     path = campaign.folder / "metric.npz"
     if not path.exists():
         problem = tunings.Problem(tuple(campaign.commands.values()), None)
         inputs = campaign.config, campaign.robot, campaign.start, problem
         matrix = pool.submit(tunings.gauss_newton_job, *inputs).result()
         save_tree(path, {"matrix": matrix}, kind="metric", robot=campaign.robot)
-    tree, _ = load_tree(path, {"matrix": np.zeros((0, 0))}, kind="metric", robot=campaign.robot)
+    tree, _ = load_tree(path, {"matrix": np.zeros((0, 0))}, kind="metric", robot=robot)
     return few_walks.space_of(tree["matrix"], box_of(campaign))
 
 
 def read_history(campaign: Campaign) -> list[Row]:
     """Return the walks so far; begin the record if the campaign is new.
+
+    Those that were reported are scored as they were then: see `reported_walks.read_reports`.
 
     Raises:
         InputError: the folder holds the record of another campaign, or a damaged one.
@@ -135,9 +145,11 @@ def read_history(campaign: Campaign) -> list[Row]:
         "methods": list(campaign.methods),
         "grounded": campaign.grounded,
     }
-    if None not in campaign.plants:  # simulated here
-        code = code_hash("runs.walks", *engine.modules)
-        head |= {"engine": engine.key, "code": code}
+    if campaign.reported:  # data: neither code nor loss can make them those of another campaign
+        settings = {"seconds": campaign.seconds, "numbers": list(campaign.numbers)}
+        head |= {"robot": walker_hash(campaign.robot), "settings": settings}
+    else:
+        head |= {"engine": engine.key, "code": code_hash("runs.walks", *engine.modules)}
 
     def parse(row: Mapping[str, Any]) -> Row:
         point, losses = np.array(row["point"], float), np.array(row["losses"], float)
@@ -146,7 +158,7 @@ def read_history(campaign: Campaign) -> list[Row]:
         losses = np.where(np.isfinite(losses), losses, np.inf)
         return Row(point, row["method"], row["predicted"], losses, float(row["margin"]))
 
-    return read_journal(campaign.folder / "walks.jsonl", head, what="tuning on walks", parse=parse)
+    return read_journal(campaign.folder / RECORD, head, what="tuning on walks", parse=parse)
 
 
 def _walked(rows: Sequence[Row]) -> list[WalkResult]:
@@ -173,48 +185,68 @@ def next_proposal(
         raise InputError(
             f"{campaign.folder}: the start fell, or a QP was not solved; tune from another"
         )
-    if (proposal := pending(campaign, rows)) is not None:
+    if (proposal := pending(campaign, len(rows))) is not None:
         return proposal, weights_at(campaign, space, proposal.point)
     history = _walked(rows)
     has_model = few_walks.needs_model(history, campaign.methods)
     model = _model(pool, campaign, space, rows) if has_model else None
     proposal = few_walks.propose(space, history, model, campaign.seed, methods=campaign.methods)
     weights = weights_at(campaign, space, proposal.point)
-    save_weights(weights_path(campaign, len(rows)), weights)
+    save_weights(weights_path(campaign.folder, len(rows)), weights)
     fields = {**proposal._asdict(), "point": proposal.point.tolist()}
-    write_json(campaign.folder / _PROPOSAL, {"walk": len(rows), **fields})
+    write_json(proposal_path(campaign, len(rows)), fields)
     return proposal, weights
 
 
-def pending(campaign: Campaign, rows: Sequence[Row]) -> Proposal | None:
-    """Return the proposal that waits for its walk, if any.
+def pending(campaign: Campaign, number: int) -> Proposal | None:
+    """Return the proposal of the next walk, of this number, if it was made.
 
     Raises:
         InputError: its file is damaged.
     """
-    path = campaign.folder / _PROPOSAL
-    table = read_json(path, "a proposal") if path.exists() else {}
+    if not (path := proposal_path(campaign, number)).exists():
+        return None
+    table = read_json(path, "a proposal")
     try:
-        if table.get("walk") != len(rows):
-            return None
         point = np.array(table["point"], float)
         if point.shape != (len(box_of(campaign)),):
             raise ValueError(f"a point of shape {point.shape}")
         return Proposal(point, table["method"], table["predicted"])
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: damaged: {one_line(error)}; remove it") from None
 
 
-def weights_path(campaign: Campaign, number: int) -> Path:
-    """Return the file of the weights of a walk."""
-    return campaign.folder / "weights" / f"{number}.json"
+def proposal_path(campaign: Campaign, number: int) -> Path:
+    """Return the file of the proposal of a walk."""
+    return campaign.folder / "proposals" / f"{number}.json"
 
 
-def evaluate_logs(pool: Executor, campaign: Campaign, logs: Sequence[Log]) -> list[ScoredLog]:
-    """Evaluate the logs of all cases; see `evaluate_log`."""
-    commands = [command for _, command in campaign.cases]
+def weights_path(folder: Path, number: int) -> Path:
+    """Return the file of the weights of a walk in the folder of a campaign."""
+    return folder / "weights" / f"{number}.json"
+
+
+def log_paths(campaign: Campaign, number: int) -> list[Path]:
+    """Return the files of the logs of a walk, one for each case."""
+    names = [f"{number}-{case}.npz" for case in range(len(campaign.cases))]
+    return [campaign.folder / "logs" / name for name in names]
+
+
+def evaluate_logs(pool: Executor, campaign: Campaign, number: int) -> list[ScoredLog]:
+    """Evaluate the logs of a walk that was reported; see `evaluate_log`."""
+    paths, commands = log_paths(campaign, number), [command for _, command in campaign.cases]
+    logs = [read_log(path, campaign.robot, campaign.seconds) for path in paths]
     inputs = repeat(campaign.config), repeat(campaign.robot), commands, logs
     return list(pool.map(evaluate_log, *inputs))
+
+
+def _plan_logs(pool: Executor, campaign: Campaign, number: int) -> list[Log]:
+    """Return the logs of a walk at the plan interval."""
+    if campaign.reported:
+        return [log for _, log in evaluate_logs(pool, campaign, number)]
+    like = log_of(no_samples(len(campaign.robot.joint_lower), len(campaign.robot.foot_point)))
+    paths = log_paths(campaign, number)
+    return [load_tree(path, like, kind="log", robot=campaign.robot)[0] for path in paths]
 
 
 def _model(pool: Executor, campaign: Campaign, space: Space, rows: Sequence[Row]) -> Model:
@@ -222,12 +254,8 @@ def _model(pool: Executor, campaign: Campaign, space: Space, rows: Sequence[Row]
     best = few_walks.best_walk(_walked(rows))
     weights = weights_at(campaign, space, rows[best].point)
     commands = [command for _, command in campaign.cases]
-    like = log_of(no_samples(len(campaign.robot.joint_lower), len(campaign.robot.foot_point)))
-    logs = [
-        load_tree(_log_path(campaign, best, case), like, kind="log", robot=campaign.robot)[0]
-        for case in range(len(commands))
-    ]
-    groundings = list(pool.map(_ground_job, repeat(campaign), repeat(weights), commands, logs))
+    inputs = repeat(campaign), repeat(weights), commands, _plan_logs(pool, campaign, best)
+    groundings = list(pool.map(_ground_job, *inputs))
 
     def evaluate(weights: Weights) -> list[Evaluation]:
         inputs = repeat(campaign), repeat(weights), commands, groundings
@@ -250,20 +278,19 @@ def _model(pool: Executor, campaign: Campaign, space: Space, rows: Sequence[Row]
     return model
 
 
-def _log_path(campaign: Campaign, number: int, case: int) -> Path:
-    return campaign.folder / "logs" / f"{number}-{case}.npz"
-
-
 def add_walk(
     campaign: Campaign, rows: Sequence[Row], proposal: Proposal, cases: Sequence[ScoredLog]
 ) -> list[Row]:
-    """Append a walk to the history and save it in the folder: first its logs, then its row."""
-    for case, (_, log) in enumerate(cases):
-        save_tree(_log_path(campaign, len(rows), case), log, kind="log", robot=campaign.robot)
-    losses = np.array([score.loss for score, _ in cases])
-    row = Row(*proposal, losses, max(score.margin for score, _ in cases))
+    """Append a walk to the history and save it in the folder: first its logs, then its row.
+
+    The logs of a walk that was reported are there already.
+    """
+    if not campaign.reported:
+        for path, (_, log) in zip(log_paths(campaign, len(rows)), cases, strict=True):
+            save_tree(path, log, kind="log", robot=campaign.robot)
+    row = row_of(proposal, cases)
     arrays = {"point": row.point.tolist(), "losses": row.losses.tolist()}
-    add_row(campaign.folder / "walks.jsonl", row._asdict() | arrays)
+    add_row(campaign.folder / RECORD, row._asdict() | arrays)
     return [*rows, row]
 
 

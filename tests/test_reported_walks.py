@@ -1,0 +1,567 @@
+"""Reports of walks: whose log is refused, what is shown of it, what is undone, and what is kept.
+
+The logs are drawn, not walked: what is tried here is what the folder makes of them.
+"""
+
+import json
+from contextlib import nullcontext, suppress
+from dataclasses import replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from test_walks import HandsOver
+
+from hector_jax.cli import evaluate, parse, propose
+from hector_jax.cli.flags import Propose, Report, Walk
+from hector_jax.control.trajectories import load_command
+from hector_jax.control.weights import expert, nominal
+from hector_jax.control.weights_file import load_weights, save_weights
+from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import State, no_samples
+from hector_jax.core.tree_file import save_tree
+from hector_jax.robot.model import load_robot
+from hector_jax.runs import campaign as campaigns
+from hector_jax.runs import reported_walks, walk_log, walks
+from hector_jax.search.few_walks import Proposal
+from hector_jax.tuning.loss import loss_of_robot
+
+SECONDS = 0.1
+SPEEDS = {"ahead": (0.5, 0.0), "aside": (0.0, 0.5), "back": (-0.5, 0.0)}
+TOML = """
+name = "{}"
+[[segment]]
+seconds = 0.1
+v_x = {}
+v_y = {}
+"""
+POINTS = 0.1 * np.random.default_rng(0).standard_normal((9, 19))
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return jax.tree.map(np.asarray, load_robot())
+
+
+def proposed(space, history, *_, **__):
+    """The next of POINTS, from the start on."""
+    first = Proposal(np.zeros(19), "start", None)
+    return Proposal(POINTS[len(history)], "model", -0.1) if history else first
+
+
+@pytest.fixture
+def folder(monkeypatch, robot, tmp_path):
+    """A folder for reports of three trajectories, in which nothing is computed for a proposal."""
+    pool = HandsOver()
+    monkeypatch.setattr(propose, "workers", lambda processes: nullcontext(pool))
+    monkeypatch.setattr(walks.few_walks, "propose", proposed)
+    monkeypatch.setattr(walks.few_walks, "needs_model", lambda *_: False)
+    monkeypatch.setattr(walks.few_walks, "incumbent", lambda _, h: walks.few_walks.best_walk(h))
+    monkeypatch.setattr(propose.arguments, "beyond", lambda *_: "")  # takes a quarter of a second
+    monkeypatch.setattr(propose.arguments, "limits", lambda *_: None)
+    monkeypatch.chdir(tmp_path)
+    for name, speed in SPEEDS.items():
+        Path(f"{name}.toml").write_text(TOML.format(name, *speed))
+    folder = Path("robot")
+    save_tree(folder / "metric.npz", {"matrix": np.eye(18)}, kind="metric", robot=robot)
+    return folder
+
+
+def next_walk(folder, names=("ahead", "aside", "back"), start="nominal"):
+    flags = {}
+    if not (folder / "config.json").exists():
+        files = tuple(f"{name}.toml" for name in names)
+        flags = {"traj": files, "start": start, "tune": ("foot_height",)}
+    propose.propose(Propose(folder, json=True, **flags))
+
+
+def drawn(robot, name, error=0.002, fall_at=None, seconds=SECONDS, place=(0.0, 0.0)):
+    """A walk along a trajectory, up to an error [m] to its left."""
+    count = round(seconds * 1000)
+    t = 1e-3 * np.arange(1, count + 1)[:, None]
+    zero = np.zeros((count, 3))
+    start = np.array([*place, robot.standing_height])
+    position = start + t * [*SPEEDS[name], 0.0] + error * np.sin(np.pi * t / seconds) * [0, 1, 0]
+    if fall_at is not None:
+        position[round(1000 * fall_at) :, 2] = 0.1
+    rng = np.random.default_rng(len(name))
+    empty = no_samples(len(robot.joint_lower), 2)
+    return empty._replace(
+        period=np.array(1e-3),
+        initial=State(np.zeros(3), start, np.zeros(3), np.zeros(3)),
+        state=State(zero, position, zero, zero),
+        command=jax.tree.map(lambda x: rng.normal(size=(count, 2, 3)), empty.command),
+        joints=np.zeros((count, 10)),
+        fallen=np.zeros(count, bool),
+        residual=np.zeros(count),
+    )
+
+
+def plain(robot, name, path=None, **options):
+    """Write a log without a card; return its name."""
+    path, log = path or f"{name}.npz", walk_log.log_of(drawn(robot, name, **options))
+    np.savez(path, **walk_log.named_leaves(log))
+    return path
+
+
+def carded(folder, robot, name, path=None, *, weights=None, number=0, card=None, **options):
+    """Write a log with the card of `hector walk --out`; return its name."""
+    path = path or f"{name}.npz"
+    weights = weights or load_weights(walks.weights_path(folder, number), robot)
+    command = load_command(Path(f"{name}.toml")).command
+    made = walk_log.walk_card(name, command, weights=weights, robot=robot, seconds=SECONDS)
+    about = {"walk": made | (card or {})}
+    walk = drawn(robot, name, **options)
+    save_tree(path, walk, kind="trajectory", robot=robot, about=about)
+    return path
+
+
+def report(folder, *logs, **flags):
+    propose.report(Report(folder, logs, json=True, **flags))
+
+
+def content(folder):
+    """All files of a folder but the lock, and what is in them."""
+    files = [path for path in folder.rglob("*") if path.is_file() and path.name != ".lock"]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def result(capsys):
+    return json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
+def refused(folder, words, *logs, **flags):
+    """A report is refused in one line, and the folder is as it was."""
+    before = content(folder)
+    with pytest.raises(InputError, match=words) as error:
+        report(folder, *logs, **flags)
+    assert "\n" not in str(error.value)
+    assert content(folder) == before
+
+
+# Whose log it is
+
+
+def test_swapped_logs_with_cards_are_refused(folder, robot):
+    next_walk(folder)
+    logs = [carded(folder, robot, name) for name in ("aside", "ahead", "back")]
+    words = r"^aside.npz: a walk of aside, expected ahead; logs in the order ahead, aside, back, or"
+    refused(folder, words, *logs)
+
+
+def test_swapped_logs_without_cards_are_refused(folder, robot):
+    next_walk(folder)
+    logs = [plain(robot, name) for name in ("ahead", "back", "aside")]
+    words = (
+        r"^back.npz: fits back \(horizontal error 0.1 cm\), expected aside \(4.0 cm\); .* aside=b"
+    )
+    refused(folder, words, *logs)
+
+
+def test_a_named_log_counts_although_another_trajectory_fits_better(folder, robot, capsys):
+    next_walk(folder)
+    logs = [f"{own}={plain(robot, other)}" for own, other in (("aside", "back"), ("back", "aside"))]
+    report(folder, plain(robot, "ahead"), *logs)
+    assert result(capsys)["logs"]["aside"]["rms_position"][0] > 0.02
+
+
+def test_logs_by_name_come_in_any_order(folder, robot, capsys):
+    next_walk(folder)
+    by_name = [f"{name}={carded(folder, robot, name)}" for name in ("back", "ahead", "aside")]
+    report(folder, *by_name)
+    assert list(result(capsys)["logs"]) == ["ahead", "aside", "back"]
+    for case, name in enumerate(("ahead", "aside", "back")):
+        kept = walks.log_paths(campaign(folder), 0)[case]
+        assert kept.read_bytes() == Path(f"{name}.npz").read_bytes()
+
+
+def test_plain_logs_are_of_the_trajectories_that_are_not_named(folder, robot):
+    next_walk(folder)
+    logs = {name: carded(folder, robot, name) for name in SPEEDS}
+    report(folder, logs["ahead"], f"aside={logs['aside']}", logs["back"])
+
+
+@pytest.mark.parametrize(
+    ("logs", "words"),
+    [
+        (("ahad=a.npz", "a.npz", "b.npz"), "LOGS: unknown trajectory 'ahad'; did you mean 'ahead'"),
+        (("ahead=a.npz", "ahead=b.npz", "c.npz"), "two files for ahead: a.npz and b.npz"),
+        (("ahead=a.npz", "b.npz"), "a log of each of ahead, aside, back, got 2 files"),
+        ((), "a log of each of ahead, aside, back, got 0 files"),
+    ],
+)
+def test_names_that_do_not_fit_are_refused(folder, logs, words):
+    next_walk(folder)
+    refused(folder, words, *logs)
+
+
+def test_a_log_of_other_weights_is_refused(folder, robot):
+    next_walk(folder, ("ahead",))
+    log = carded(folder, robot, "ahead", weights=expert(robot))
+    words = r"^ahead.npz: a walk with other weights than the proposed ones, robot/weights/0.json$"
+    refused(folder, words, log)
+    own = load_weights(walks.weights_path(folder, 0), robot)
+    higher = own._replace(others={"foot_height": own.others["foot_height"] + 0.01})
+    refused(folder, words, carded(folder, robot, "ahead", weights=higher))
+
+
+def test_a_log_of_the_set_before_is_refused(folder, robot):
+    next_walk(folder, ("ahead",))
+    log = carded(folder, robot, "ahead")
+    report(folder, log)
+    next_walk(folder, ("ahead",))
+    refused(folder, "other weights than the proposed ones, robot/weights/1.json", log)
+
+
+def test_a_log_of_another_command_of_the_same_name_is_refused(folder, robot):
+    next_walk(folder, ("ahead",))
+    log = carded(folder, robot, "ahead", card={"command": "0123456789abcdef"})
+    refused(folder, "a walk of ahead with another command, expected ahead;", log)
+
+
+@pytest.mark.parametrize(
+    ("card", "words"),
+    [
+        ({"robot": "0123456789abcdef"}, "a walk of another robot, or with another gait"),
+        ({"seconds": 4.0}, "a walk of 4.0 s, expected 0.1 s"),
+        ({"trajectory": "eight", "command": "0"}, "a walk of eight, expected ahead"),
+        ({"trajectory": 7, "command": []}, "a walk of 7, expected ahead"),
+    ],
+)
+def test_a_log_of_another_robot_or_length_is_refused(folder, robot, card, words):
+    next_walk(folder, ("ahead",))
+    refused(folder, f"^ahead.npz: {words}", carded(folder, robot, "ahead", card=card))
+
+
+@pytest.mark.parametrize("at", [0.01, 0.5, -20])  # in the card, in the numbers, in the hash
+def test_a_log_with_a_damaged_card_is_refused(folder, robot, at):
+    next_walk(folder, ("ahead",))
+    log = Path(carded(folder, robot, "ahead"))
+    data = bytearray(log.read_bytes())
+    data[int(at * len(data)) if at > 0 else at] ^= 1
+    log.write_bytes(data)
+    refused(folder, "^ahead.npz: ", str(log))
+
+
+def test_a_card_that_was_edited_is_refused(folder, robot):
+    next_walk(folder, ("ahead",))
+    log = carded(folder, robot, "ahead", weights=expert(robot))
+    with np.load(log) as archive:
+        np.savez("edited.npz", **archive)
+    refused(folder, "^edited.npz: cut or changed since it was written", "edited.npz")
+
+
+def test_a_card_of_no_walk_is_that_of_a_log_without_one(folder, robot, capsys):
+    next_walk(folder, ("ahead",))
+    save_tree("log.npz", drawn(robot, "ahead"), kind="trajectory", robot=robot)
+    report(folder, "log.npz")
+    assert result(capsys)["walk"] == 0
+
+
+# What is shown
+
+
+def test_what_a_log_shows_is_printed_before_it_counts(folder, robot, capsys):
+    next_walk(folder, ("ahead",))
+    log = plain(robot, "ahead", error=0.03, place=(1.0, 2.0))
+    propose.report(Report(folder, (log,)))
+    shown = " ".join(capsys.readouterr().err.split())
+    assert "ahead.npz: ahead; RMS error 2.1 cm horizontally, 0.0 cm in height" in shown
+    assert "roll 0.0, pitch 0.0, yaw 0.0 degrees" in shown
+    assert f"from x 1.00, y 2.00, height {robot.standing_height:.2f} m, yaw 0 degrees" in shown
+    assert "walked 0.1 s" in shown
+
+
+def test_a_fallen_walk_is_reported_as_one(folder, robot, capsys):
+    next_walk(folder, ("ahead",))
+    report(folder, plain(robot, "ahead"))
+    next_walk(folder, ("ahead",))
+    capsys.readouterr()
+    # it fits another trajectory better, as a walk that fell may
+    report(folder, plain(robot, "back", "ahead.npz", fall_at=0.04))
+    seen = json.loads((captured := capsys.readouterr()).out)
+    assert "fell after 0.04 s" in " ".join(captured.err.split())
+    assert (seen["walk"], seen["best"], seen["change"]) == (1, 0, None)
+    assert seen["logs"]["ahead"]["fell"] is True
+    assert seen["logs"]["ahead"]["seconds"] == pytest.approx(0.04)
+
+
+# Undo
+
+
+def test_a_report_that_is_undone_and_made_again_leaves_the_same_bytes(folder, robot, capsys):
+    next_walk(folder, ("ahead",))
+    report(folder, plain(robot, "ahead", "0.npz"))
+    next_walk(folder, ("ahead",))
+    before = content(folder)
+    report(folder, carded(folder, robot, "ahead", "1.npz", number=1))
+    after = content(folder)
+    next_walk(folder, ("ahead",))  # which the undo makes void
+    capsys.readouterr()
+    report(folder, undo=True)
+    undone = result(capsys)
+    assert (undone["walk"], undone["weights"]) == (1, "robot/weights/1.json")
+    (log,) = undone["logs"]
+    assert Path(log).read_bytes() == Path("1.npz").read_bytes()
+    assert content(folder).items() >= before.items()
+    next_walk(folder, ("ahead",))
+    assert result(capsys)["walk"] == 1
+    report(folder, "1.npz")
+    again = content(folder)
+    assert again.items() >= after.items()
+    kept = {str(Path(log).relative_to(folder)), "weights/2.json"}
+    assert again.keys() - after.keys() == kept  # and no proposal from the history before
+
+
+def test_another_log_after_an_undo_counts_in_place_of_the_first(folder, robot, capsys):
+    next_walk(folder, ("ahead",))
+    report(folder, plain(robot, "ahead", "wrong.npz", error=0.01))
+    capsys.readouterr()
+    propose.report(Report(folder, (), undo=True))
+    shown = capsys.readouterr().out
+    assert shown.startswith("walk 0 is to be walked again, with robot/weights/0.json; its logs: ")
+    report(folder, plain(robot, "ahead", "right.npz"))
+    logs = sorted((folder / "logs").iterdir())
+    assert [log.read_bytes() for log in logs] == [
+        Path("wrong.npz").read_bytes(),
+        Path("right.npz").read_bytes(),
+    ]
+    assert len(rows(folder)) == 1
+
+
+def test_each_undo_takes_back_one_report_until_there_is_none(folder, robot, capsys):
+    contents = []
+    for number in range(3):
+        next_walk(folder, ("ahead",))
+        contents.append(content(folder))
+        report(folder, carded(folder, robot, "ahead", f"{number}.npz", number=number))
+    for number in (2, 1, 0):
+        capsys.readouterr()
+        report(folder, undo=True)
+        assert result(capsys)["walk"] == number
+        assert content(folder).items() >= contents[number].items()
+    refused(folder, "^robot: no report to undo$", undo=True)
+    for number in range(3):  # the logs of the undone are there to be reported again
+        assert content(folder).items() >= contents[number].items()
+        (log,) = (folder / "logs").glob(f"{number}-0-undone-*.npz")
+        report(folder, str(log))
+        next_walk(folder)
+
+
+def test_the_line_has_logs_or_undo(folder):
+    Path("a=b.npz").write_text("")
+    for line in ("robot --undo", "robot ahead=a=b.npz --undo", "robot ahead=a=b.npz"):
+        parse.check(parse.from_line(["report", *line.split()]))
+    for line, words in (
+        ("robot", "LOGS expects a value, got none"),
+        ("robot ahead=nowhere.npz", "nowhere.npz: cannot read the file: No such file"),
+    ):
+        with pytest.raises(InputError, match=words):
+            parse.check(parse.from_line(["report", *line.split()]))
+
+
+def test_undo_takes_no_logs(folder, robot):
+    next_walk(folder, ("ahead",))
+    log = plain(robot, "ahead")
+    report(folder, log)
+    refused(folder, "^--undo takes no LOGS, got 1 file$", log, undo=True)
+
+
+STEPS = [(walks, "add_row"), (reported_walks, "write_file"), (Path, "replace"), (Path, "unlink")]
+
+
+@pytest.mark.parametrize("undo", [True, False])
+def test_a_report_or_undo_that_is_killed_leaves_the_old_or_the_new_state(
+    folder, robot, undo, capsys
+):
+    """Killed before and after each of its writes; then the same once more."""
+    next_walk(folder, ("ahead",))
+    report(folder, carded(folder, robot, "ahead", "0.npz"))
+    next_walk(folder, ("ahead",))
+    log = carded(folder, robot, "ahead", "1.npz", number=1)
+    if undo:
+        report(folder, log)
+        next_walk(folder, ("ahead",))
+    call = {"undo": True} if undo else {}
+    logs = () if undo else (log,)
+    record, old, kills, calls = folder / "walks.jsonl", (folder / "walks.jsonl").read_bytes(), 0, []
+
+    def killed(real, at, after):
+        def step(*args, **options):
+            calls.append(real)
+            this = len(calls) == at
+            if this and not after:
+                raise KeyboardInterrupt
+            done = real(*args, **options)
+            if this and after:
+                raise KeyboardInterrupt
+            return done
+
+        return step
+
+    for at, after in product(range(1, 6), (False, True)):
+        with pytest.MonkeyPatch.context() as patch:
+            calls.clear()
+            for module, name in STEPS:
+                patch.setattr(module, name, killed(getattr(module, name), at, after))
+            with suppress(KeyboardInterrupt):
+                report(folder, *logs, **call)
+        kills += len(calls) >= at
+        number = len(rows(folder))
+        waiting = walks.pending(campaign(folder), number)
+        assert Path("1.npz").read_bytes() in content(folder).values() or not undo
+        if record.read_bytes() == old:
+            assert (number, waiting is None) == (2 if undo else 1, False)
+            continue
+        assert (number, waiting is None) == (1 if undo else 2, not undo)
+        if undo:
+            report(folder, log)
+            next_walk(folder)
+        else:
+            report(folder, undo=True)
+        assert record.read_bytes() == old
+    assert kills == 2 * len(calls) > 4
+
+
+# Data
+
+
+def campaign(folder):
+    return propose._campaign(propose.from_file(Propose, folder / "config.json"))
+
+
+def rows(folder):
+    return reported_walks.read_reports(HandsOver(), campaign(folder))
+
+
+@pytest.fixture
+def walked(folder, robot):
+    """Two walks of two trajectories were reported."""
+    for number in range(2):
+        next_walk(folder, ("ahead", "aside"))
+        error = 0.003 * (1 + number)
+        report(folder, *(plain(robot, name, error=error) for name in ("ahead", "aside")))
+    return folder
+
+
+def test_reports_are_scored_by_the_present_loss(walked, monkeypatch):
+    before, files = rows(walked), content(walked)
+
+    def heavier(description):
+        return loss_of_robot(replace(description, loss=(("L_pos", 1e9),)))
+
+    monkeypatch.setattr(propose.tunings, "loss_of_robot", heavier)
+    after, one = rows(walked), campaign(walked)
+    for number, (old, new) in enumerate(zip(before, after, strict=True)):
+        scores = walks.evaluate_logs(HandsOver(), one, number)
+        np.testing.assert_array_equal(new.losses, [score.loss for score, _ in scores])
+        assert np.all(new.losses > 2.0 * old.losses)
+        np.testing.assert_array_equal(new.point, old.point)
+    assert (before[1].predicted, after[1].predicted) == (-0.1, None)  # it was of the other loss
+    assert content(walked) == files
+    next_walk(walked)  # and it goes on
+
+
+def test_reports_are_scored_by_the_present_code_of_the_loss(walked, monkeypatch):
+    before, files, loss_of = rows(walked), content(walked), walk_log.loss_of
+    monkeypatch.setattr(walk_log, "loss_of", lambda *inputs: 2.0 * loss_of(*inputs))
+    for old, new in zip(before, rows(walked), strict=True):
+        np.testing.assert_array_equal(new.losses, 2.0 * old.losses)
+    assert content(walked) == files
+
+
+def test_reports_are_those_of_a_robot_whose_file_weighs_its_loss_otherwise(walked, robot):
+    one = campaign(walked)
+    heavier = replace(robot.description, loss=(("L_pos", 1e9),), nominal=None, max_tilt=0.7)
+    walks.read_history(replace(one, robot=robot._replace(description=heavier)))
+    other = replace(robot.description, control=(("gait", (("tick", 0.02),)),))
+    with pytest.raises(InputError, match="its robot is"):
+        walks.read_history(replace(one, robot=robot._replace(description=other)))
+
+
+def test_reports_outlive_the_code_and_packages_that_took_them(walked, monkeypatch):
+    before, files = rows(walked), content(walked)
+    for module in ("cache", "walks"):
+        monkeypatch.setattr(f"hector_jax.runs.{module}.code_hash", lambda *_: "of other code")
+    monkeypatch.setattr("hector_jax.core.environment.version", lambda package: "99")
+    for old, new in zip(before, rows(walked), strict=True):
+        jax.tree.map(np.testing.assert_array_equal, old, new)
+    assert content(walked) == files
+
+
+def test_points_follow_from_the_weights_where_the_code_places_them_otherwise(walked, monkeypatch):
+    unit = campaigns._unit
+    monkeypatch.setattr(campaigns, "_unit", lambda *inputs: 3.0 * unit(*inputs))
+    one = campaign(walked)
+    space = walks.space_of(HandsOver(), one)
+    for number, row in enumerate(rows(walked)):
+        kept = load_weights(walks.weights_path(walked, number), one.robot)
+        again = campaigns.weights_at(one, space, row.point)
+        jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-12), again, kept)
+    assert row.point[-1] == pytest.approx(POINTS[1, -1] / 3.0)
+
+
+def test_a_folder_goes_on_where_its_start_is_another_file_now(folder, robot):
+    save_weights(Path("mine.json"), nominal(robot))
+    files, tune = ("ahead.toml",), ("foot_height",)
+    propose.propose(Propose(folder, files, "mine.json", tune=tune))
+    save_weights(Path("mine.json"), expert(robot))  # as another release ships another `best`
+    report(folder, carded(folder, robot, "ahead"))
+    Path("mine.json").unlink()
+    propose.propose(Propose(folder))
+    np.testing.assert_allclose(campaign(folder).start.Q.euler, nominal(robot).Q.euler)
+
+
+def test_a_log_in_the_folder_that_is_damaged_is_named_and_can_be_undone(walked, capsys):
+    path = walks.log_paths(campaign(walked), 1)[0]
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(InputError, match=r"^robot/logs/1-0.npz: not a log"):
+        rows(walked)
+    capsys.readouterr()
+    report(walked, undo=True)
+    assert result(capsys)["walk"] == 1
+    assert len(rows(walked)) == 1
+
+
+# From end to end
+
+
+def test_the_point_of_weights_is_the_one_that_they_came_from(folder):
+    next_walk(folder, ("ahead",))
+    one = campaign(folder)
+    space = walks.space_of(HandsOver(), one)
+    for point in POINTS:
+        weights = campaigns.weights_at(one, space, point)
+        np.testing.assert_allclose(campaigns.point_of(one, space, weights), point, atol=1e-12)
+
+
+def test_the_log_of_a_walk_with_the_proposed_file_is_taken(folder, robot, capsys):
+    """From weights with unlike feet, which are tied, and with numbers beside Q and R."""
+    start = nominal(robot)
+    uneven = start.R.force * [[1.0], [2.0 / 3.0]]
+    others = {"footstep_width": np.array(0.07)}
+    save_weights(
+        Path("uneven.json"), start._replace(R=start.R._replace(force=uneven), others=others)
+    )
+
+    def walk(weights, **flags):
+        evaluate.walk(Walk(traj="ahead.toml", weights=weights, out=Path("log.npz"), **flags))
+        return "log.npz"
+
+    next_walk(folder, ("ahead",), start="uneven.json")
+    first = result(capsys)["weights"]
+    refused(folder, f"other weights than the proposed ones, {first}", walk("uneven.json"))
+    stiffer = (description := robot.description).path.read_text().replace("kp = [60", "kp = [61")
+    Path("stiffer.toml").write_text(stiffer)
+    Path("hector.xml").write_bytes(description.model.read_bytes())
+    other = walk(first, robot=Path("stiffer.toml"))
+    refused(folder, "a walk of another robot, or with another gait", other)
+    report(folder, walk(first))
+    next_walk(folder)  # the other flags are those of the folder
+    second = result(capsys)["weights"]
+    refused(folder, f"other weights than the proposed ones, {second}", walk(first))
+    report(folder, f"ahead={walk(second, world='standin', seed=3)}")
+    assert result(capsys)["walk"] == 1
