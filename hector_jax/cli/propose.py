@@ -60,12 +60,14 @@ def report(args: Report) -> None:
     if args.undo:
         _undo(args, campaign)
         return
-    files = _files(args.logs, list(campaign.commands))
+    texts = list(map(str, args.logs))
+    files = _files(texts, list(campaign.commands))
     with locked(args.folder), workers(args.processes) as pool:
         number = len(walks.read_history(campaign))
         if (proposal := walks.pending(campaign, number)) is None:
             raise InputError(f"{args.folder}: no walk is waited for; begin with hector propose")
-        tracked = _check_logs(args, campaign, number, files)
+        named = [name for name in files if any(text.startswith(f"{name}=") for text in texts)]
+        tracked = _check_logs(campaign, number, files, named)
         rows = reported_walks.add_report(pool, campaign, proposal, list(files.values()))
         _, best_number = walks.answer(campaign, walks.space_of(pool, campaign), rows)
     changes = walks.changes(rows)
@@ -110,10 +112,13 @@ def _files(texts: Sequence[str], names: Sequence[str]) -> dict[str, Path]:
 
 
 def _check_logs(
-    args: Report, campaign: Campaign, number: int, files: Mapping[str, Path]
+    campaign: Campaign, number: int, files: Mapping[str, Path], named: Sequence[str]
 ) -> dict[str, dict[str, Any]]:
-    """Show how the logs track, and refuse those of other walks; returns `walk_log.tracking`."""
-    robot, path = campaign.robot, walks.weights_path(args.folder, number)
+    """Show how the logs track, and refuse those of other walks; returns `walk_log.tracking`.
+
+    The user said of which trajectory the `named` ones are.
+    """
+    robot, path = campaign.robot, walks.weights_path(campaign.folder, number)
     walked = load_weights(path, robot), robot, campaign.seconds
     proposed = {n: walk_log.walk_card(n, x, *walked) for n, x in campaign.commands.items()}
     result = {}
@@ -123,8 +128,7 @@ def _check_logs(
         tracked = {n: walk_log.tracking(*inputs, x, log) for n, x in campaign.commands.items()}
         result[name] = tracked[name]
         say(f"{file}: {name}; {_tracking_text(result[name])}")
-        named = any(text.startswith(f"{name}=") for text in args.logs)
-        if not walk_log.check_card(file, name, proposed, path) and not named:
+        if not walk_log.check_card(file, name, proposed, path) and name not in named:
             walk_log.check_fit(file, name, tracked)
     return result
 
