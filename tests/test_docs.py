@@ -354,8 +354,12 @@ def test_notebooks_run_to_their_end(name, tmp_path):
     [
         ("nominal", "s", {5: (1.44, 5.83), 10: (1.44, 4.23), 25: (1.42, 2.66), 50: (1.38, 2.17)}),
         ("nominal", "s", {100: (1.33, 1.59), 200: (1.30, 1.53)}),
-        ("tuned-200", "s", {50: (1.41, 1.50), 100: (1.38, 1.43), 200: (1.34, 1.40)}),
-        ("tuned-s", "s", {5: (1.54, 1.82), 10: (1.49, 1.69), 25: (1.43, 1.63), 50: (1.40, 1.49)}),
+        ("shared_mean-200", "s", {50: (1.41, 1.50), 100: (1.38, 1.43), 200: (1.34, 1.40)}),
+        (
+            "shared_mean-s",
+            "s",
+            {5: (1.54, 1.82), 10: (1.49, 1.69), 25: (1.43, 1.63), 50: (1.40, 1.49)},
+        ),
         ("drake", "s", {5: (1.54, 7.17), 25: (1.49, 3.85)}),
         ("humanoid", "straight", {5: (1.34, 1.40), 10: (1.29, 1.32)}),
     ],
@@ -374,14 +378,14 @@ def test_the_race_is_told_as_its_files_have_it(race, traj, losses):
 
 
 def test_the_race_on_other_plants_is_told_as_its_file_has_it():
-    races = json.loads((DOCS / "race" / "tuned" / "race.json").read_text())
+    races = json.loads((DOCS / "race" / "shared_mean" / "race.json").read_text())
     page, told = (DOCS / "notes.md").read_text(), {}
     for walks in ("0", "5", "10", "25", "50"):
         cells = []
         for plants in ("own", "others"):
             for traj in ("straight", "c", "s"):
                 losses = {n: np.median(r[plants][walks]) / 1e6 for n, r in races[traj].items()}
-                ours = losses.pop("mean-of-all walks")
+                ours = losses.pop("shared_mean walks")
                 best = min(losses.values())
                 told[plants, traj, walks] = ours
                 cells.append(f"{ours:.2f}" if walks == "0" else f"{ours:.2f}, {best:.2f}")
@@ -411,7 +415,7 @@ def test_what_a_part_is_worth_is_told_as_its_file_has_it():
         "no evolution": "without evolution",
     }
     for method, words in names.items():
-        losses = parts[f"mean-of-all {method}"]["own"]
+        losses = parts[f"shared_mean {method}"]["own"]
         told = re.search(rf"{words} ([\d. ]+\d)", page).group(1).split()
         assert told == [f"{np.median(losses[n]) / 1e6:.2f}" for n in ("5", "10", "25", "50")]
 
