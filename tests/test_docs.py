@@ -155,7 +155,7 @@ def test_make_table_ends_with_a_verdict_of_its_sets(quick):
     last = parse.from_line(shlex.split(said.replace("\\\n", " ").splitlines()[-1])[1:])
     folder = Path("runs/table/quick" if quick else "runs/table")
     own = [text.split("=") for text in last.weights if f"={folder}" in text]
-    assert own == [[name, f"{folder}/weights/{name}"] for name in ("without", "with", "searched")]
+    assert own == [[name, f"{folder}/weights/{name}"] for name in ("without", "with", "search_200")]
     assert {name for name, _ in own} <= set(SETS)
     assert last.out == folder / "verdict"
 
@@ -222,7 +222,7 @@ def test_the_table_of_the_readme_is_that_of_the_results():
 
 def test_the_table_of_the_results_page_is_that_of_its_files():
     shown, files = rows(DOCS / "results.md"), (changes("."), changes("seeds-1000"))
-    for which in ("with", "with_walks", "shared_mean", "ceiling"):
+    for which in ("with", "with_walks", "shared_mean", "search_2000"):
         for name, text in zip(COMMANDS, shown[which][: len(COMMANDS)], strict=True):
             each = [one[name, which] for one in files]
             pairs = [f"{x['nominal']['median']:.0f} / {x['expert']['median']:.0f}" for x in each]
