@@ -451,8 +451,7 @@ def test_the_table_of_the_search_over_many_plants_is_that_of_its_walks():
     there = {n: np.array([*x.values()]) for n, x in walks["L_where_searched"].items()}
     ratios = {name: np.median(L / there["nominal"], axis=1) for name, L in there.items()}
     of_weights, of_all = (
-        " ".join(f"{x:.0f}" for x in 100 * (ratios[f"search, {name}"] - 1))
-        for name in ("weights", "all")
+        " ".join(f"{x:.0f}" for x in 100 * (ratios[name] - 1)) for name in ("search", "search_all")
     )
     assert f"is {of_weights} (weights) and {of_all} % (all)" in page
 
