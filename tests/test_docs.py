@@ -166,6 +166,41 @@ def test_files_that_pages_name_are_there(path):
     assert [name for name in named if not (ROOT / name).exists()] == []
 
 
+# names that sets had: shared_mean, shared_worst, search_200, search_2000, integral, search
+FORMER = re.compile(
+    r"""(mean|worst)[-\ ]of[-\ ]all | ceiling | race/tuned | integral-best-limited
+    | ["`](integral,\ limited | search,\ weights | search,\ all)["`]
+    | (["'`*,]|\|\ |median_|against\ )(searched|shared)(["'`*,]|\ \||\ against)
+    | \b(searched|shared)= | ^(searched|shared)\ & """,
+    re.IGNORECASE | re.MULTILINE | re.VERBOSE,
+)
+RECORDED = r"hector table .*|runs/docs/ceiling"  # how the table was made, with the names of then
+
+
+def test_a_weight_set_has_one_name():
+    for text in (
+        "`shared` is",
+        "| searched |",
+        "s,searched,L",
+        "median_searched,",
+        "shared=a.json",
+    ):
+        assert FORMER.search(text), text
+    for text in ("the shared sets", "batch.py shared", "L_where_searched", "is searched for"):
+        assert not FORMER.search(text), text
+    kinds = {".csv", ".j2", ".json", ".md", ".png", ".py", ".tex", ".webp"}
+    folders = (DOCS, ROOT / "experiments", ROOT / "hector_jax")
+    files = [ROOT / "README.md", ROOT / "Makefile"]
+    files += [p for folder in folders for p in folder.rglob("*") if p.suffix in kinds]
+    files = [path for path in files if not MADE & set(path.parts)]
+    assert len(files) > 300
+    for path in files:
+        name = path.relative_to(ROOT).as_posix()
+        text = "" if path.suffix in (".png", ".webp") else path.read_text()
+        found = FORMER.search(name + "\n" + re.sub(RECORDED, "", text))
+        assert not found, (name, found)
+
+
 @pytest.mark.parametrize("kind", [*flags.COMMANDS.values(), Table], ids=lambda kind: kind.__name__)
 def test_every_flag_has_a_row_among_the_commands(kind):
     text = (DOCS / "commands.md").read_text()
