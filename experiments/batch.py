@@ -259,7 +259,7 @@ def shared(flags: Shared) -> None:
     alone = tune(flags, robot, effects, problems, "one set for each")
     scales = alone.history.evaluation.loss[:, 0].tolist()
     walks = [scenario(robot, c, scale=k) for c, k in zip(commands.values(), scales, strict=True)]
-    tails = {"mean of all": 1.0, "worst of all": 0.0}
+    tails = {"shared_mean": 1.0, "shared_worst": 0.0}
     problems = [problem(nominal(), walks, tail) for tail in tails.values()]
     together = tune(flags, robot, effects, problems, "one set for all")
     if not first_host():

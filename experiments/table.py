@@ -46,12 +46,12 @@ DIFFTUNE = ("without", "with")  # tuned on the model
 SETS = (
     "nominal",
     "expert",
-    "searched",
+    "search_200",
     *(f"{name}_ten" for name in DIFFTUNE),
     *DIFFTUNE,
     "with_walks",
 )
-CEILING = "ceiling"
+LONG_SEARCH = "search_2000"
 
 # limits of `quick`, for a trial of some minutes on two cores
 _QUICK = {"seeds": 4, "rollouts": 10, "iterations": 20, "steps": 2, "step_plants": 2}
@@ -68,13 +68,14 @@ class Flags(Configured):
     seeds: Plants = 32  # stand-in plants
     first_seed: Seed = 0  # first plant: 0 in development, 1000 for the final evaluation
     family: Family = "standin"  # of the plants; even: masses drawn evenly about the nominal ones
-    # walks of the search, row `searched`
+    # walks of the search, row `search_200`
     rollouts: Annotated[int, Range(SearchConfig.population, 1_000_000)] = 200
     iterations: Iterations = 100  # largest number of iterations of each tuning
     steps: Annotated[int, Range(0, 10_000)] = 30  # steps of row `with_walks`; 0: no such row
     step_plants: Annotated[int, Range(1, 1000)] = 8  # simulator plants for each of these steps
     extra: tuple[str, ...] = ()  # more rows, NAME=FOLDER of straight.json, c.json and s.json
-    ceiling: Path = Path("docs/results/ceiling")  # folder of row `ceiling`, if it exists
+    # folder of row `search_2000`, if it exists
+    search_2000: Path = Path("docs/results/search_2000")
     earlier: Path | None = None  # table.json of other plants, to compare the order of the sets
     data: Folder = Path("data")  # folder of the walks and the net, which are made if missing
     out: Folder = Path("runs/table")  # folder for the report
@@ -92,8 +93,8 @@ class Flags(Configured):
 class Files(NamedTuple):
     """Contents of the files in the flags, read before any computation."""
 
-    sets: Mapping[str, Mapping[str, Weights]]  # the ceiling and extra ones, by trajectory
-    ceilings: Mapping[str, Search]  # the long searches, by trajectory
+    sets: Mapping[str, Mapping[str, Weights]]  # of the long searches and extra ones, by trajectory
+    long_searches: Mapping[str, Search]  # by trajectory
     earlier: Earlier | None
 
 
@@ -147,22 +148,22 @@ def read_files(flags: Flags) -> Files:
         name, _, folder = text.partition("=")
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or not folder:
             raise InputError(f"--extra must be NAME=FOLDER, NAME of letters and digits, got {text}")
-        if name in (*SETS, CEILING, *folders):
+        if name in (*SETS, LONG_SEARCH, *folders):
             raise InputError(f"--extra {text}: there is a set '{name}' already")
         folders[name] = Path(folder)
-    sets, ceilings = {}, {}
+    sets, long_searches = {}, {}
     for name in flags.trajectories:
         if name not in COMMANDS:
             raise InputError(f"--trajectories must be of {', '.join(COMMANDS)}, got {name}")
         paths = {key: folder / f"{name}.json" for key, folder in folders.items()}
-        if (ceiling := flags.ceiling / f"{name}.json").exists():
-            paths = {CEILING: ceiling, **paths}
-            ceilings[name] = _read_card(ceiling.with_name(f"{name}-card.json"))
+        if (file := flags.search_2000 / f"{name}.json").exists():
+            paths = {LONG_SEARCH: file, **paths}
+            long_searches[name] = _read_card(file.with_name(f"{name}-card.json"))
         sets[name] = {key: load_weights(path) for key, path in paths.items()}
     earlier = (
         None if flags.earlier is None else load_earlier(flags.earlier, flags.plants, flags.family)
     )
-    return Files(sets, ceilings, earlier)
+    return Files(sets, long_searches, earlier)
 
 
 def _read_card(path: Path) -> Search:
@@ -214,7 +215,7 @@ def _make_table(
             name: Search(len(s.history) * budget.population, s.walk, s.loss, s.stop)
             for name, s in searches.items()
         },
-        ceilings=files.ceilings,
+        long_searches=files.long_searches,
         pictures=draw(out, robot, by_trajectory, {n: w.first for n, w in walks.items()}),
         config=settings,
         environment=about,
@@ -233,7 +234,7 @@ def _rows(
     return {
         "nominal": nominal(),
         "expert": expert(),
-        "searched": search.weights,
+        "search_200": search.weights,
         **{f"{name}_ten": tunings[name].tuning.ten for name in DIFFTUNE},
         **{name: tuned.tuning.converged for name, tuned in tunings.items()},
         **extra,

@@ -20,7 +20,7 @@ from hector_jax.robot.model import Robot
 from hector_jax.runs.metrics import BASELINES, Verdict, compare
 
 _MAIN = ("nominal", "expert", "without", "with")  # more lines cannot be distinguished
-_BEST = "ceiling"
+_BEST = "search_2000"
 _SNAPSHOTS = VideoConfig(height=360)
 
 
@@ -130,8 +130,8 @@ def collective(path: Path, walks: Mapping[str, Trajectory], snapshots: Path | No
     Args:
         path: file to write.
         walks: by weight set, on the same plant and command. Drawn are nominal, expert, without and
-            with, at least one of them, and, on the path only, the ceiling. The footprints are those
-            of `with`, or of the last.
+            with, at least one of them, and, on the path only, search_2000. The footprints are
+            those of `with`, or of the last.
         snapshots: picture of the walk, two rows of tiles, or None.
     """
     walks = {name: walks[name] for name in sorted(walks, key="with".__eq__)}

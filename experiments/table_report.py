@@ -50,9 +50,9 @@ PAPER = {
 PARTS = ("L_Eul", "L_pos", "L_ctrl", "L")  # in that order
 TITLES = {"straight": "Straight line", "c": "C curve", "s": "S curve"}
 OTHERS = {  # further sets to compare a set with, besides the baselines
-    "with": ("without", "searched", "ceiling"),
+    "with": ("without", "search_200", "search_2000"),
     "with_ten": ("without_ten",),
-    "with_walks": ("with", "ceiling"),
+    "with_walks": ("with", "search_2000"),
 }
 
 Summaries = Mapping[tuple[str, str], Summary]  # by trajectory and set
@@ -98,7 +98,7 @@ class Table(NamedTuple):
     falls: Sequence[Fall]
     tunings: Mapping[str, Mapping[str, Tuning]]  # by trajectory and set
     searches: Mapping[str, Search]  # by trajectory
-    ceilings: Mapping[str, Search]  # long searches, by trajectory, if any
+    long_searches: Mapping[str, Search]  # by trajectory, if any
     pictures: Sequence[Picture]
     config: Mapping[str, Any]  # resolved, as JSON values
     environment: Mapping[str, str]
@@ -289,7 +289,8 @@ def _result(table: Table, sets: Summaries) -> dict[str, Any]:
             name: {"iterations": len(tuning.history) - 1, "stop": tuning.stop}
             for name, tuning in table.tunings.get(trajectory, {}).items()
         }
-        for key, searches in (("search", table.searches), ("ceiling", table.ceilings)):
+        kinds = {"search_200": table.searches, "search_2000": table.long_searches}
+        for key, searches in kinds.items():
             if trajectory in searches:
                 result[key] = searches[trajectory]._asdict()
         trajectories[trajectory] = result

@@ -155,7 +155,7 @@ def test_make_table_ends_with_a_verdict_of_its_sets(quick):
     last = parse.from_line(shlex.split(said.replace("\\\n", " ").splitlines()[-1])[1:])
     folder = Path("runs/table/quick" if quick else "runs/table")
     own = [text.split("=") for text in last.weights if f"={folder}" in text]
-    assert own == [[name, f"{folder}/weights/{name}"] for name in ("without", "with", "searched")]
+    assert own == [[name, f"{folder}/weights/{name}"] for name in ("without", "with", "search_200")]
     assert {name for name, _ in own} <= set(SETS)
     assert last.out == folder / "verdict"
 
@@ -164,6 +164,41 @@ def test_make_table_ends_with_a_verdict_of_its_sets(quick):
 def test_files_that_pages_name_are_there(path):
     named = re.findall(r"\b(?:experiments|examples|assets)/[\w/.-]+\.\w+", path.read_text())
     assert [name for name in named if not (ROOT / name).exists()] == []
+
+
+# names that sets had: shared_mean, shared_worst, search_200, search_2000, integral, search
+FORMER = re.compile(
+    r"""(mean|worst)[-\ ]of[-\ ]all | ceiling | race/tuned | integral-best-limited
+    | ["`](integral,\ limited | search,\ weights | search,\ all)["`]
+    | (["'`*,]|\|\ |median_|against\ )(searched|shared)(["'`*,]|\ \||\ against)
+    | \b(searched|shared)= | ^(searched|shared)\ & """,
+    re.IGNORECASE | re.MULTILINE | re.VERBOSE,
+)
+RECORDED = r"hector table .*|runs/docs/ceiling"  # how the table was made, with the names of then
+
+
+def test_a_weight_set_has_one_name():
+    for text in (
+        "`shared` is",
+        "| searched |",
+        "s,searched,L",
+        "median_searched,",
+        "shared=a.json",
+    ):
+        assert FORMER.search(text), text
+    for text in ("the shared sets", "batch.py shared", "L_where_searched", "is searched for"):
+        assert not FORMER.search(text), text
+    kinds = {".csv", ".j2", ".json", ".md", ".png", ".py", ".tex", ".webp"}
+    folders = (DOCS, ROOT / "experiments", ROOT / "hector_jax")
+    files = [ROOT / "README.md", ROOT / "Makefile"]
+    files += [p for folder in folders for p in folder.rglob("*") if p.suffix in kinds]
+    files = [path for path in files if not MADE & set(path.parts)]
+    assert len(files) > 300
+    for path in files:
+        name = path.relative_to(ROOT).as_posix()
+        text = "" if path.suffix in (".png", ".webp") else path.read_text()
+        found = FORMER.search(name + "\n" + re.sub(RECORDED, "", text))
+        assert not found, (name, found)
 
 
 @pytest.mark.parametrize("kind", [*flags.COMMANDS.values(), Table], ids=lambda kind: kind.__name__)
@@ -222,7 +257,7 @@ def test_the_table_of_the_readme_is_that_of_the_results():
 
 def test_the_table_of_the_results_page_is_that_of_its_files():
     shown, files = rows(DOCS / "results.md"), (changes("."), changes("seeds-1000"))
-    for which in ("with", "with_walks", "shared_mean", "ceiling"):
+    for which in ("with", "with_walks", "shared_mean", "search_2000"):
         for name, text in zip(COMMANDS, shown[which][: len(COMMANDS)], strict=True):
             each = [one[name, which] for one in files]
             pairs = [f"{x['nominal']['median']:.0f} / {x['expert']['median']:.0f}" for x in each]
@@ -235,8 +270,8 @@ def test_what_the_readme_says_of_the_verdict_is_in_its_file():
     text = " ".join((ROOT / "README.md").read_text().split())
     sets, ratios, voids = result["sets"], [], []
     for base in ("nominal", "expert"):
-        assert all(of["shared"]["change"][base]["high"] < 0 for of in cells)
-        against = sets["shared"]["against"][base]
+        assert all(of["shared_mean"]["change"][base]["high"] < 0 for of in cells)
+        against = sets["shared_mean"]["against"][base]
         ratios.append(min(one["gain"] / one["spread"] for one in against["spread"]))
         voids.append(against["void"])
     falls = {name: one["falls"] for name, one in sets.items()}
@@ -246,10 +281,10 @@ def test_what_the_readme_says_of_the_verdict_is_in_its_file():
     down = [f"{np.floor(10 * ratio) / 10:.1f}" for ratio in ratios]
     assert f"Its gain is at least {down[0]} and {down[1]} times" in text
     assert (
-        f"Of {sets['nominal']['walks']} walks `shared_mean` falls in {falls['shared']}, `nominal` "
-        f"in {falls['nominal']}, `expert` in {falls['expert']}, `without` in {falls['without']}, "
-        f"a search on one plant in {falls['searched']}, `with` in {falls['with']}, of which "
-        f"{on_c} on"
+        f"Of {sets['nominal']['walks']} walks `shared_mean` falls in {falls['shared_mean']}, "
+        f"`nominal` in {falls['nominal']}, `expert` in {falls['expert']}, `without` in "
+        f"{falls['without']}, `search_2000`, a search on one plant, in {falls['search_2000']}, "
+        f"`with` in {falls['with']}, of which {on_c} on"
     ) in text
 
 
@@ -354,8 +389,12 @@ def test_notebooks_run_to_their_end(name, tmp_path):
     [
         ("nominal", "s", {5: (1.44, 5.83), 10: (1.44, 4.23), 25: (1.42, 2.66), 50: (1.38, 2.17)}),
         ("nominal", "s", {100: (1.33, 1.59), 200: (1.30, 1.53)}),
-        ("tuned-200", "s", {50: (1.41, 1.50), 100: (1.38, 1.43), 200: (1.34, 1.40)}),
-        ("tuned-s", "s", {5: (1.54, 1.82), 10: (1.49, 1.69), 25: (1.43, 1.63), 50: (1.40, 1.49)}),
+        ("shared_mean-200", "s", {50: (1.41, 1.50), 100: (1.38, 1.43), 200: (1.34, 1.40)}),
+        (
+            "shared_mean-s",
+            "s",
+            {5: (1.54, 1.82), 10: (1.49, 1.69), 25: (1.43, 1.63), 50: (1.40, 1.49)},
+        ),
         ("drake", "s", {5: (1.54, 7.17), 25: (1.49, 3.85)}),
         ("humanoid", "straight", {5: (1.34, 1.40), 10: (1.29, 1.32)}),
     ],
@@ -374,14 +413,14 @@ def test_the_race_is_told_as_its_files_have_it(race, traj, losses):
 
 
 def test_the_race_on_other_plants_is_told_as_its_file_has_it():
-    races = json.loads((DOCS / "race" / "tuned" / "race.json").read_text())
+    races = json.loads((DOCS / "race" / "shared_mean" / "race.json").read_text())
     page, told = (DOCS / "notes.md").read_text(), {}
     for walks in ("0", "5", "10", "25", "50"):
         cells = []
         for plants in ("own", "others"):
             for traj in ("straight", "c", "s"):
                 losses = {n: np.median(r[plants][walks]) / 1e6 for n, r in races[traj].items()}
-                ours = losses.pop("mean-of-all walks")
+                ours = losses.pop("shared_mean walks")
                 best = min(losses.values())
                 told[plants, traj, walks] = ours
                 cells.append(f"{ours:.2f}" if walks == "0" else f"{ours:.2f}, {best:.2f}")
@@ -411,7 +450,7 @@ def test_what_a_part_is_worth_is_told_as_its_file_has_it():
         "no evolution": "without evolution",
     }
     for method, words in names.items():
-        losses = parts[f"mean-of-all {method}"]["own"]
+        losses = parts[f"shared_mean {method}"]["own"]
         told = re.search(rf"{words} ([\d. ]+\d)", page).group(1).split()
         assert told == [f"{np.median(losses[n]) / 1e6:.2f}" for n in ("5", "10", "25", "50")]
 
@@ -447,8 +486,7 @@ def test_the_table_of_the_search_over_many_plants_is_that_of_its_walks():
     there = {n: np.array([*x.values()]) for n, x in walks["L_where_searched"].items()}
     ratios = {name: np.median(L / there["nominal"], axis=1) for name, L in there.items()}
     of_weights, of_all = (
-        " ".join(f"{x:.0f}" for x in 100 * (ratios[f"search, {name}"] - 1))
-        for name in ("weights", "all")
+        " ".join(f"{x:.0f}" for x in 100 * (ratios[name] - 1)) for name in ("search", "search_all")
     )
     assert f"is {of_weights} (weights) and {of_all} % (all)" in page
 

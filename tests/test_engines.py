@@ -27,7 +27,7 @@ from hector_jax.tuning.loss import PAPER_LOSS
 HECTOR = load_robot()
 CONFIG = walk_config(HECTOR)
 WORLDS = {"ideal": ideal, "hfs": hfs}
-NAMES = ("mean-of-all", "c-alone")
+NAMES = ("shared_mean", "c-alone")
 ROOT = Path(__file__).parents[1]
 FILES = [None, *(ROOT / "examples" / name / "robot.toml" for name in ("humanoid", "quadruped"))]
 

@@ -98,17 +98,17 @@ def test_the_four_sets_of_most_pictures_stay_apart_in_grey():
 
 
 def test_a_legend_begins_with_the_names_of_the_tables():
-    for name in (*FOUR, "with_ten", "shared_mean", "ceiling", "mine"):
+    for name in (*FOUR, "with_ten", "shared_mean", "search_2000", "mine"):
         assert label_of(name).split(" (")[0] == name
 
 
-def test_the_collective_figure_has_the_four_sets_and_the_ceiling(tmp_path, drawn, walks):
-    more = {name: walks["expert"] for name in ("searched", "shared_mean", "ceiling")} | walks
+def test_the_collective_figure_has_the_four_sets_and_the_long_search(tmp_path, drawn, walks):
+    more = {name: walks["expert"] for name in ("search_200", "shared_mean", "search_2000")} | walks
     caption = table_plots.collective(tmp_path / "more.png", more, None)
     assert "of nominal, expert, without, with," in caption
     path, *panels = drawn[0].axes
     drawn_lines = {label for label in lines(path) if not label.endswith("set down")}
-    assert drawn_lines == {label_of(name) for name in (*FOUR, "ceiling")} | {"reference"}
+    assert drawn_lines == {label_of(name) for name in (*FOUR, "search_2000")} | {"reference"}
     for panel in panels:
         assert {label for label in lines(panel) if label[0] != "_"} == set(map(label_of, FOUR))
 

@@ -89,7 +89,7 @@ def test_the_plants_of_the_verdict_are_asked_for_once_and_after_all_that_tunes(
 
 
 def table(tmp_path, **changes):
-    return Flags(**{"out": tmp_path / "out", "ceiling": tmp_path / "ceiling", **changes})
+    return Flags(**{"out": tmp_path / "out", "search_2000": tmp_path / "search_2000", **changes})
 
 
 def test_a_quick_table_leaves_what_it_promises_beside_the_whole_one(tmp_path, asked):
@@ -116,26 +116,26 @@ def test_a_quick_table_leaves_what_it_promises_beside_the_whole_one(tmp_path, as
     assert {path.parent.name for path in out.glob("weights/*/s.json")} == set(study.SETS)
 
 
-def test_a_ceiling_and_extra_sets_are_rows_and_cost_only_their_own_walks(
+def test_a_long_search_and_extra_sets_are_rows_and_cost_only_their_own_walks(
     tmp_path, asked, monkeypatch
 ):
     monkeypatch.setattr(study, "draw", lambda *args: [])
     small = {"trajectories": ("s",), "seeds": 2}
     study.make_table(table(tmp_path, **small), plants)
     assert asked["walks"] == 16
-    for folder in ("ceiling", "other"):
+    for folder in ("search_2000", "other"):
         save_weights(tmp_path / folder / "s.json", nominal())
     with pytest.raises(ValueError, match=r"s-card.json: cannot read the card of a search"):
         study.make_table(table(tmp_path, **small), plants)
     card = {"walks": 2000, "best_at": 1234, "L": {"best": 1e6}, "stop": "50 generations"}
-    (tmp_path / "ceiling" / "s-card.json").write_text(json.dumps(card))
+    (tmp_path / "search_2000" / "s-card.json").write_text(json.dumps(card))
     found = table(tmp_path, **small, extra=(f"mine={tmp_path / 'other'}",))
     told, verdicts = study.make_table(found, plants)
-    assert list(verdicts["s"].scores) == [*study.SETS, "ceiling", "mine"]
+    assert list(verdicts["s"].scores) == [*study.SETS, "search_2000", "mine"]
     assert asked["walks"] == 16 + 4
     text = told.read_text()
-    assert "`with` against `ceiling`" in text
-    assert "| s: `ceiling` | 2000 | 1234 | 1.000 | 50 generations |" in text
+    assert "`with` against `search_2000`" in text
+    assert "| s: `search_2000` | 2000 | 1234 | 1.000 | 50 generations |" in text
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ def with_losses(score, **losses):
     return score._replace(losses=score.losses | losses)
 
 
-GOOD = {"nominal": 5e6, "expert": 4e6, "searched": 2e6, "without": 3e6, "with": 1.5e6}
+GOOD = {"nominal": 5e6, "expert": 4e6, "search_200": 2e6, "without": 3e6, "with": 1.5e6}
 
 
 def whole(**verdicts):
@@ -43,7 +43,7 @@ def whole(**verdicts):
         falls=[],
         tunings={name: {"without": tuning, "with": tuning} for name in verdicts},
         searches={name: Search(200, 187, 1.2e6, "20 generations") for name in verdicts},
-        ceilings={},
+        long_searches={},
         pictures=[Picture("pictures/s.png", "Snapshots.")],
         config={"flags": {"seeds": 4}},
         environment={"jax": "0.10", "commit": "abc"},
@@ -67,7 +67,7 @@ def test_the_papers_total_is_the_weighted_sum_of_its_parts():
 
 
 def test_the_ranking_is_by_the_median_of_the_paired_ratio():
-    assert table.ranking(judged(**GOOD)) == ["with", "searched", "without", "expert", "nominal"]
+    assert table.ranking(judged(**GOOD)) == ["with", "search_200", "without", "expert", "nominal"]
 
 
 def test_the_order_is_held_against_that_of_an_earlier_table(tmp_path):
@@ -79,14 +79,14 @@ def test_the_order_is_held_against_that_of_an_earlier_table(tmp_path):
         table.load_earlier(tmp_path / "table.json", range(4))
     assert table.swapped_sets({"s": judged(**GOOD)}, earlier) == {"s": []}
     other = judged(**GOOD | {"with": 2.5e6})
-    assert table.swapped_sets({"s": other}, earlier) == {"s": [("with", "searched")]}
+    assert table.swapped_sets({"s": other}, earlier) == {"s": [("with", "search_200")]}
     assert table.swapped_sets({"c": judged(**GOOD)}, earlier) == {"c": None}
-    for verdict, words in ((judged(**GOOD), "the same"), (other, "`with` and `searched`")):
+    for verdict, words in ((judged(**GOOD), "the same"), (other, "`with` and `search_200`")):
         text = write_table(tmp_path, whole(s=verdict)._replace(earlier=earlier)).read_text()
         assert "The order of the sets, against that on seeds 0-3" in text
         assert re.search(rf"^- s: .*{words}$", text, re.MULTILINE)
         (swapped,) = json.loads((tmp_path / "table.json").read_text())["swapped"].values()
-        assert swapped == ([] if words == "the same" else [["with", "searched"]])
+        assert swapped == ([] if words == "the same" else [["with", "search_200"]])
 
 
 @pytest.mark.parametrize("content", [None, "", "[]", "{}", '{"trajectories": {"s": 1}}'])
@@ -129,11 +129,11 @@ def test_the_report_tells_everything_that_was_promised(tmp_path):
     text = write_table(tmp_path, whole(s=judged(**GOOD))).read_text()
     for words in (
         "hardware stand-in",
-        "s: `with` against `searched`",
+        "s: `with` against `search_200`",
         "| s: with_ten | 1.47e3 | 286 | 1.02e6 | 2.05e8 |",
         "![Snapshots.](pictures/s.png)",
         "None of the 20 walks ended in a fall.",
-        "| s: `searched` | 200 | 187 | 1.200 | 20 generations |",
+        "| s: `search_200` | 200 | 187 | 1.200 | 20 generations |",
         "ended because: the step became too small to gain",
         "were made at `abc`",
         "python experiments/table.py",
@@ -202,4 +202,4 @@ def test_words_are_escaped_for_latex():
 def test_baselines_are_not_told_against_themselves():
     found = summaries({"s": judged(**GOOD)})
     assert list(found["s", "nominal"].against) == ["expert"]
-    assert list(found["s", "with"].against) == [*BASELINES, "without", "searched"]
+    assert list(found["s", "with"].against) == [*BASELINES, "without", "search_200"]

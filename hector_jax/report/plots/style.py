@@ -26,13 +26,13 @@ SETS = {
     "without": {"color": ORANGE, "linestyle": (0, (4, 1.2, 1, 1.2))},
     "with": {"color": GREEN, "linestyle": "-"},
     "best": {"color": "#1f2f8f", "linestyle": "-"},
-    "searched": {"color": "#a566c7", "linestyle": (0, (1.2, 1.2))},
+    "search_200": {"color": "#a566c7", "linestyle": (0, (1.2, 1.2))},
     "without_ten": {"color": "#ecb27c", "linestyle": (0, (4, 1.2, 1, 1.2)), "linewidth": 0.9},
     "with_ten": {"color": "#63b89f", "linestyle": "-", "linewidth": 0.9},
     "with_walks": {"color": "#00805f", "linestyle": (0, (3, 1))},
     "shared_mean": {"color": "#b0186a", "linestyle": (0, (8, 1.5))},
     "shared_worst": {"color": "#d670a5", "linestyle": (0, (8, 1.5, 1, 1.5, 1, 1.5))},
-    "ceiling": {"color": "#5c3a1e", "linestyle": (0, (8, 1.5, 1, 1.5))},
+    "search_2000": {"color": "#5c3a1e", "linestyle": (0, (8, 1.5, 1, 1.5))},
 }
 """Lines of the package's weight sets; `looks_of` returns a look for any set."""
 
@@ -52,14 +52,13 @@ MARK = {"color": "0.5", "linestyle": (0, (2, 2)), "linewidth": 0.9, "zorder": 0}
 """A line across a panel at an iteration or time."""
 
 _MARKER = {"nominal": "v", "expert": "D", "without": "s", "with": "o", "best": "p"}
-_MARKER |= {"ceiling": "*", "shared_mean": "<", "shared_worst": ">"}
+_MARKER |= {"search_2000": "*", "shared_mean": "<", "shared_worst": ">"}
 _SPARE_STYLE = {"linestyle": (0, (2.5, 1, 1, 1, 1, 1)), "linewidth": 1.1}
 _SPARE = (("#b8447a", "s"), ("#6cb0dc", "^"), ("#8a8a00", "h"), ("black", "P"), ("#c07a3a", "X"))
 _NAMES = {
     "without": "without (tuned, no net)",
     "with": "with (tuned, net)",
     "best": "best (tuned)",
-    "ceiling": "ceiling (long search)",
     "predicted": "predicted by the net",
     "linear": "predicted by a linear map",
     "paper": "predicted by the paper's net",

@@ -5,8 +5,8 @@ CMA-ES over the mean loss on several plants of `hfs-varied` and all three comman
 distribution. It walks on the plants of the search and on as many others: what it gains on the
 former alone is fitted to them.
 
-    python experiments/ceiling.py --tune weights
-    python experiments/ceiling.py --tune all --generations 40
+    python experiments/many_plants.py --tune weights
+    python experiments/many_plants.py --tune all --generations 40
 
 Report, weights and the generations so far are in OUT/TUNE; a later call continues there.
 """
@@ -150,7 +150,7 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
 
 
 def main() -> None:
-    """Search, and write report.md, ceiling.json and the weights."""
+    """Search, and write report.md, many-plants.json and the weights."""
     flags = tyro.cli(Flags)
     setup_jax()
     robot, engine = jax.tree.map(np.asarray, load_robot(flags.robot)), choose_engine(flags.engine)
@@ -166,14 +166,19 @@ def main() -> None:
     with workers(flags.processes) as pool:
         answer = search(pool, campaign, engine, flags)
         save_weights(folder / "weights.json", answer)
-        sets = {"nominal": nominal(robot), "expert": expert(robot), "start": start, "found": answer}
+        sets = {
+            "nominal": nominal(robot),
+            "expert": expert(robot),
+            "start": start,
+            "search": answer,
+        }
         judge = partial(verdicts.judge, Setup(pool, config, robot), sets, folder=folder / "scores")
         scores = {
             name: judge(command, plants, seeds, title=f"walking {name}").scores
             for name, command in commands.items()
         }
     rows, numbers = [], {}
-    for title, part in (("searched", slice(count)), ("others", slice(count, None))):
+    for title, part in (("own", slice(count)), ("others", slice(count, None))):
         for name in sets:
             each = [
                 metrics.make_verdict(
@@ -188,15 +193,15 @@ def main() -> None:
     walks = flags.generations * flags.population * len(campaign.cases)
     text = (
         f"{walks} walks, engine {engine.title}, on plants {first} to {first + count - 1} of "
-        f"hfs-varied; `others` are {first + count} to {first + 2 * count - 1}. Change of L against "
-        "nominal in %, median over the plants with its 95 % interval, walked in MuJoCo C; falls of "
-        f"{plural(count * len(commands), 'walk')}."
+        f"hfs-varied (`own`); `others` are {first + count} to {first + 2 * count - 1}. Change of L "
+        "against nominal in %, median over the plants with its 95 % interval, walked in MuJoCo C; "
+        f"falls of {plural(count * len(commands), 'walk')}."
     )
     table = markdown_table(["plants", "set", *commands, "falls"], rows)
     path, title = folder / "report.md", "A search over many plants"
     numbers = {"losses": numbers}
-    print(write_report(path, title, [text, table], numbers=numbers, json_name="ceiling.json"))
+    print(write_report(path, title, [text, table], numbers=numbers, json_name="many-plants.json"))
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code("ceiling", main))
+    sys.exit(exit_code("many_plants", main))

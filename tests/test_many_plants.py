@@ -7,11 +7,11 @@ from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import NamedTuple
 
-import ceiling
 import jax
+import many_plants
 import numpy as np
 import pytest
-from ceiling import Flags, losses_of, search
+from many_plants import Flags, losses_of, search
 from model import AHEAD, BRIEF
 
 from hector_jax.control.weights import nominal, scale_weights, weights_to_vector
@@ -56,7 +56,7 @@ def campaign(tmp_path):
 
 
 def test_the_search_finds_the_bottom_and_continues_after_its_generations(campaign, monkeypatch):
-    monkeypatch.setattr(ceiling, "losses_of", bowl)
+    monkeypatch.setattr(many_plants, "losses_of", bowl)
     start, flags = campaign.start, Flags(generations=60, population=12)
     found = search(Executor(), campaign, ENGINE, flags)
     losses = [next(bowl(None, campaign, None, [w]))[0] for w in (start, found)]
@@ -75,7 +75,7 @@ def test_the_search_finds_the_bottom_and_continues_after_its_generations(campaig
 
 
 def test_each_set_walks_all_plants_and_an_unsolved_walk_counts_as_the_worst(campaign, monkeypatch):
-    monkeypatch.setattr(ceiling, "_losses", lambda loss, walks: walks.loss)
+    monkeypatch.setattr(many_plants, "_losses", lambda loss, walks: walks.loss)
 
     def walk(pool, config, robot, jobs, *, exact, batch):
         del pool, config, robot, exact
@@ -90,7 +90,7 @@ def test_each_set_walks_all_plants_and_an_unsolved_walk_counts_as_the_worst(camp
 
 
 def test_a_start_with_an_unsolved_qp_is_refused(campaign, monkeypatch):
-    monkeypatch.setattr(ceiling, "losses_of", lambda *_, batch: iter([np.array([1.0, np.inf])]))
+    monkeypatch.setattr(many_plants, "losses_of", lambda *_, batch: iter([np.array([1.0, np.inf])]))
     with pytest.raises(InputError, match="--start: a QP of these weights is not solved"):
         search(Executor(), campaign, ENGINE, Flags(population=12))
 
@@ -108,20 +108,20 @@ def test_the_report_compares_the_sets_on_both_groups_of_plants(tmp_path, monkeyp
         return SimpleNamespace(scores=scores)
 
     monkeypatch.setattr(verdicts, "judge", judge)
-    monkeypatch.setattr(ceiling, "search", lambda pool, campaign, *_: campaign.start)
-    monkeypatch.setattr(ceiling, "workers", lambda count: nullcontext())
-    monkeypatch.setattr(sys, "argv", ["ceiling.py", "--plants", "4", "--out", str(tmp_path)])
-    ceiling.main()
+    monkeypatch.setattr(many_plants, "search", lambda pool, campaign, *_: campaign.start)
+    monkeypatch.setattr(many_plants, "workers", lambda count: nullcontext())
+    monkeypatch.setattr(sys, "argv", ["many_plants.py", "--plants", "4", "--out", str(tmp_path)])
+    many_plants.main()
     path = tmp_path / "weights" / "report.md"
     assert str(path) in capsys.readouterr().out
     text = path.read_text()
-    assert "on plants 100 to 103 of hfs-varied; `others` are 104 to 107." in text
-    assert "| searched | found | +300 [+300, +300] | +300" in text
-    assert "| others | found | -75 [-75, -75] | -75 [-75, -75] | -75 [-75, -75] | 0 |" in text
+    assert "on plants 100 to 103 of hfs-varied (`own`); `others` are 104 to 107." in text
+    assert "| own | search | +300 [+300, +300] | +300" in text
+    assert "| others | search | -75 [-75, -75] | -75 [-75, -75] | -75 [-75, -75] | 0 |" in text
     assert "| others | nominal | +0.0 [+0.0, +0.0] |" in text
     assert "| 12 |" in text
-    numbers = json.loads((tmp_path / "weights" / "ceiling.json").read_text())
-    assert numbers["losses"]["others found"] == [[1.0] * 4] * 3
+    numbers = json.loads((tmp_path / "weights" / "many-plants.json").read_text())
+    assert numbers["losses"]["others search"] == [[1.0] * 4] * 3
     assert (tmp_path / "weights" / "weights.json").exists()
 
 
