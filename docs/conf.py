@@ -64,7 +64,7 @@ PUBLIC = {  # of packages without `__all__`, in whichever of their modules they 
         tune descend""",
     "search": "SearchConfig search",
     "runs": "Score score Verdict make_verdict load_run export",
-    "report": "compare_runs write_film write_events",
+    "report": "compare_runs write_film",
 }
 _ROLE = re.compile(r"\{(?:func|class|mod|meth)\}`(hector_jax[\w.]*)`")
 logger = logging.getLogger(__name__)

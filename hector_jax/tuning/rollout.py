@@ -50,8 +50,8 @@ class RolloutConfig:
 
     def __post_init__(self) -> None:
         not_negative = dict.fromkeys(("lead", "estimate_noise"), NOT_NEGATIVE)
-        delay = Range(0.0, self.walk.gait.tick)
-        check(self, ticks=Range(2), block=AT_LEAST_ONE, delay=delay, **not_negative)
+        check(self, ticks=Range(2), block=AT_LEAST_ONE, **not_negative)
+        check(self, delay=Range(0.0, self.walk.gait.tick))
         if self.lead > -self.walk.gait.first_tick:
             raise InputError(
                 "RolloutConfig.lead must not reach back before the gait starts "
