@@ -175,7 +175,7 @@ def hfs_drawn(seed: int, share: float = 0.2, description: Description = HECTOR) 
 
 
 def hfs_varied(seed: int, description: Description = HECTOR) -> Imperfections:
-    """Draw one of the 20 plants around the hfs on which our variants are compared."""
+    """Draw one of the plants around the hfs on which our variants are compared."""
     return hfs_drawn(seed, 0.4, description)
 
 
