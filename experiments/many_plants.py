@@ -112,8 +112,8 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
 
     head = {
         "robot": robot_hash(campaign.robot),
-        "settings": content_key(campaign.config, code=engine.modules),
-        "engine": engine.name,
+        "settings": content_key(campaign.config, code=("runs.walks", *engine.modules)),
+        "engine": engine.key,
         "numbers": list(campaign.numbers),
         "start": weights_tree(campaign.start),
         "plants": [tree_hash(plant) for plant in campaign.plants],

@@ -18,7 +18,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -47,6 +47,7 @@ from hector_jax.grfm.network import effect_of
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import tunings, verdicts, walks
+from hector_jax.runs.cache import content_key
 from hector_jax.runs.campaign import Campaign, box_of, weights_at
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.walks import Row
@@ -313,8 +314,11 @@ def lead(losses: Losses, entry: Entry, budget: int, *, charge: int = 0) -> Lead:
 def read_model(pool: Executor, campaign: Campaign, *, searches: bool) -> Model:
     """Return what the model tells of a start, with searches if a rival learns from them.
 
-    It is computed once, in the folder of the campaign.
+    It is computed once, in a folder of its own for all that it depends on.
     """
+    settings = campaign.config, campaign.robot, campaign.start, tuple(campaign.commands.values())
+    key = content_key(*settings, SEARCHES, SOURCES, code=("runs.walks",))
+    campaign = replace(campaign, folder=campaign.folder / key)
     path, size = campaign.folder / "searches.npz", len(box_of(campaign))
     parts = {"steps": np.zeros((0, size)), "losses": np.zeros(0)}
     if searches and not path.exists():
@@ -355,10 +359,11 @@ def main() -> None:
     with workers(flags.processes) as pool:
         pairs = list(product(flags.traj, sets))
         searches = any(method.removesuffix(METRIC) in LEARN for method in flags.methods)
-        folders = {pair: flags.out / "models" / "-".join(pair) for pair in pairs}
         models = {
-            pair: read_model(pool, campaign_of(*pair, folder), searches=searches)
-            for pair, folder in folders.items()
+            (traj, start): read_model(
+                pool, campaign_of(traj, start, flags.out / "models"), searches=searches
+            )
+            for traj, start in pairs
         }
         inputs = [(campaigns[c], c, models[c[:2]], flags.walks) for c in contests]
         with bar("racing") as report_progress:

@@ -34,7 +34,7 @@ from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
 
 # modules that decide the numbers, for `content_key`
-SEARCH_CODE = ("search.cmaes", "tuning.loss", "sim.walk", "sim.parallel")
+SEARCH_CODE = ("runs.searches", "sim.walk", "sim.parallel")
 WALKS_CODE = (*tunings.TUNING_CODE, "tuning.grounded", "tuning.sensitivity", "sim.walk")
 # part of the cache keys, as WALKS_CODE
 MEASURED = Path(adaptation.__file__).read_text() + Path(measured.__file__).read_text()
@@ -54,7 +54,7 @@ def search(
     """Search without derivatives from nominal, for all trajectories in lock-step."""
     engine, (_, tune, robot, _) = choose_engine("auto"), bench.setup
     settings = replace(config, budget=config.population)  # a record continues to any budget
-    model = engine.name, tune.rollout, repr(tune.loss)
+    model = engine.key, tune.rollout, repr(tune.loss)
     key = content_key(*model, settings, robot, hfs(), nominal(), code=SEARCH_CODE)
     return searches.search(
         bench.setup,

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import sys
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
@@ -116,6 +117,51 @@ def test_values_that_a_function_holds_are_of_its_content(tmp_path, name):
     one, other = (module(tmp_path, TEXT.format(**SAME | {name: x})) for x in (6.0, 8.0))
     assert function_id(getattr(one, name)) != function_id(getattr(other, name))
     assert function_id(one.made) == function_id(other.made)
+
+
+AROUND = {
+    "vmap": "def h(x): return K * x\nf = jax.vmap(h)",
+    "checkpoint": "def h(x): return K * x\nf = jax.checkpoint(h)",
+    "value_and_grad": "def h(x): return K * x\nf = jax.value_and_grad(h)",
+    "jit of vmap": "def h(x): return K * x\nf = jax.jit(jax.vmap(h))",
+    "used inside": "@jax.jit\ndef h(x): return K * x\ndef f(x): return jax.vmap(h)(x)",
+    "optax": "s = optax.linear_schedule(K, 0.0, 10)\ndef f(x): return s(x)",
+    "np.vectorize": "def h(x): return K * x\nf = np.vectorize(h)",
+    "base class": "class B:\n    k = K\nclass C(B):\n    def __call__(self, x): return x\nf = C()",
+    "NamedTuple": "class N(NamedTuple):\n    a: float\nn = N(K)\ndef f(x): return n.a * x",
+    "slots": "class S:\n    __slots__ = 'a'\ns = S()\ns.a = K\ndef f(x): return s.a * x",
+    "property": "class C:\n    k = property(lambda self: K)\nc = C()\ndef f(x): return c.k * x",
+    "range": "r = range(int(K))\ndef f(x): return len(r) * x",
+    "path": "p = Path(str(K))\ndef f(x): return p",
+    "other name": "a, b = jax.numpy.sin, jax.numpy.cos\nc = a if K < 2.5 else b\ndef f(x): return c(x)",
+}
+IMPORTS = """
+from pathlib import Path
+from typing import NamedTuple
+import jax, optax, numpy as np
+"""
+
+
+@pytest.mark.parametrize("text", AROUND.values(), ids=AROUND)
+def test_a_function_of_the_user_is_seen_through_what_holds_it(tmp_path, text):
+    ids = [function_id(module(tmp_path, f"{IMPORTS}K = {k}\n{text}\n").f) for k in (2.0, 2.0, 3.0)]
+    assert ids[0] == ids[1] != ids[2]
+
+
+def test_a_module_that_a_module_of_the_user_imports_is_of_the_content(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def made(gain):
+        for name, text in (
+            ("third_of_user", f"K = {gain}\n"),
+            ("helper_of_user", "from third_of_user import K\ndef f(x): return K * x\n"),
+        ):
+            monkeypatch.setitem(sys.modules, name, module(tmp_path, text, name))
+        return function_id(
+            module(tmp_path, "import helper_of_user\ndef f(x): return helper_of_user.f(x)\n").f
+        )
+
+    assert made(2.0) == made(2.0) != made(3.0)
 
 
 def test_our_functions_and_installed_ones_have_their_names():

@@ -42,7 +42,7 @@ def bowl(pool, campaign, engine, sets, batch=0):
         yield np.full(len(campaign.cases), 1.0 + distance + 10.0 * gain)
 
 
-ENGINE = SimpleNamespace(name="bowl", modules=())
+ENGINE = SimpleNamespace(name="bowl", key="bowl", modules=())
 
 
 @pytest.fixture

@@ -127,11 +127,13 @@ def with_gait(robot: Robot, name: str) -> Robot:
     """
     if name == "own":
         return robot
-    description = robot.description
+    description, own = robot.description, walk_config(robot).gait
     try:
-        gait = gait_named(walk_config(robot).gait, name)
+        gait = gait_named(own, name)
     except InputError as error:
         raise InputError(f"--gait: {error}") from None
+    if gait == own:
+        return robot
     control = dict(description.control) | {"gait": tuple(to_table(gait).items())}
     return robot._replace(description=replace(description, control=tuple(control.items())))
 

@@ -48,8 +48,8 @@ def evaluate(args: Evaluate) -> None:
     seconds = arguments.walk_seconds(args, trajectory)
     count = args.seeds
     if args.world in ("ideal", "hfs"):  # one plant each, and nothing random
-        for name in ("seeds", "first_seed"):
-            if args.is_given(name) and getattr(args, name) != {"seeds": 1}.get(name, 0):
+        for name, only in (("seeds", 1), ("first_seed", 0)):
+            if args.is_given(name) and getattr(args, name) != only:
                 flag = f"--{name.replace('_', '-')} {getattr(args, name)}"
                 raise InputError(f"{flag}: --world {args.world} is one plant without a seed")
         count = 1

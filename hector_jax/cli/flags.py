@@ -29,6 +29,12 @@ class Source(Enum):
     ROBOT = "a TOML file that names an MJCF (docs/howto/robot.md)"
 
 
+def named_file(text: str) -> tuple[str, str]:
+    """Return name and file of NAME=FILE; without a name, as in a/b=c, the name is ""."""
+    name, _, file = text.partition("=")
+    return (name, file) if file and "/" not in name else ("", text)
+
+
 Processes = Annotated[int, Range(1, 1024)]
 Plants = Annotated[int, Range(1, 10_000)]
 Seed = Annotated[int, SEED]

@@ -25,6 +25,7 @@ from hector_jax.cli.flags import (
     Source,
     Tune,
     command,
+    named_file,
     with_given,
 )
 from hector_jax.core.inputs import InputError, check_file, did_you_mean, one_line, short_repr
@@ -175,7 +176,8 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
 
 def as_table(flags: Any) -> dict[str, Any]:
     """Return the flags as JSON values, including those from a file; `from_file` reads them."""
-    table = {name: value for name, value in to_table(flags).items() if name != "config"}
+    names = [field.name for field in fields(flags) if field.name != "config"]
+    table = {name: to_table(getattr(flags, name)) for name in names}
     if isinstance(table.get("traj"), list | tuple) and len(table["traj"]) == 1:
         (table["traj"],) = table["traj"]  # a word, as in older runs
     return table
@@ -240,7 +242,7 @@ def _check_source(label: str, value: Path | str, source: Source) -> None:
     if source is Source.SETS:
         text = str(Path(text.rpartition("=")[2]))  # without NAME=
     if source is Source.LOG:
-        text = text.split("=", 1)[-1]
+        _, text = named_file(text)
     path, named, is_dir = Path(text), text in NAMED_WEIGHTS, os.path.isdir(text)
     existing = next(x for x in (path, *path.parents) if os.path.exists(x))
     valid, is_file = {

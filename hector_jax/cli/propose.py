@@ -10,7 +10,7 @@ import numpy as np
 
 from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.arguments import print_result
-from hector_jax.cli.flags import Propose, Report
+from hector_jax.cli.flags import Propose, Report, named_file
 from hector_jax.cli.parse import as_table, from_file
 from hector_jax.control.parameters import leg_numbers, model_numbers
 from hector_jax.control.weights_file import load_weights
@@ -66,7 +66,7 @@ def report(args: Report) -> None:
         number = len(walks.read_history(campaign))
         if (proposal := walks.pending(campaign, number)) is None:
             raise InputError(f"{args.folder}: no walk is waited for; begin with hector propose")
-        named = [name for name in files if any(text.startswith(f"{name}=") for text in texts)]
+        named = [name for name, _ in map(named_file, texts)]
         tracked = _check_logs(campaign, number, files, named)
         rows = reported_walks.add_report(pool, campaign, proposal, list(files.values()))
         _, best_number = walks.answer(campaign, walks.space_of(pool, campaign), rows)
@@ -96,14 +96,15 @@ def _undo(args: Report, campaign: Campaign) -> None:
 def _files(texts: Sequence[str], names: Sequence[str]) -> dict[str, Path]:
     """Return the log of each trajectory, one by one, from LOGS; else raise an InputError."""
     named: dict[str, Path] = {}
-    for name, file in (text.split("=", 1) for text in texts if "=" in text):
-        if name not in names:
+    for name, file in map(named_file, texts):
+        if name and name not in names:
             raise InputError(f"LOGS: {unknown('trajectory', name, names)}")
         if name in named:
             raise InputError(f"LOGS has two files for {name}: {named[name]} and {file}")
-        named[name] = Path(file)
+        if name:
+            named[name] = Path(file)
     others = [name for name in names if name not in named]
-    plain = [Path(text) for text in texts if "=" not in text]
+    plain = [Path(file) for name, file in map(named_file, texts) if not name]
     if len(plain) != len(others):
         expected = f"a log of each of {', '.join(names)}"
         raise InputError(f"LOGS must be {expected}, got {plural(len(texts), 'file')}")
@@ -121,7 +122,7 @@ def _check_logs(
     robot, path = campaign.robot, walks.weights_path(campaign.folder, number)
     walked = load_weights(path, robot), robot, campaign.seconds
     proposed = {n: walk_log.walk_card(n, x, *walked) for n, x in campaign.commands.items()}
-    result = {}
+    result, before = {}, [p for n in range(number) for p in walks.log_paths(campaign, n)]
     for name, file in files.items():
         log = walk_log.read_log(file, robot, campaign.seconds)
         inputs = campaign.config, robot
@@ -130,6 +131,8 @@ def _check_logs(
         say(f"{file}: {name}; {_tracking_text(result[name])}")
         if not walk_log.check_card(file, name, proposed, path) and name not in named:
             walk_log.check_fit(file, name, tracked)
+        if again := [p for p in before if p.read_bytes() == file.read_bytes()]:
+            raise InputError(f"{file}: was reported before, it is {again[0]}")
     return result
 
 

@@ -189,12 +189,16 @@ def by_folder(args: Tune, base: Path | None, robot: Robot) -> dict[Path, Tune]:
         robot: robot to tune.
 
     Raises:
-        InputError: two trajectories have one name, or --resume lacks --each.
+        InputError: two trajectories have one name, or --resume lacks --each or should lack it.
     """
     if args.resume:
         single = sorted(path.parent for path in args.resume.glob(f"*/{CONFIG}"))
         if single and not args.each:
             raise InputError(f"{args.resume}: its trajectories were tuned one by one; add --each")
+        if args.each and not single:
+            raise InputError(
+                f"{args.resume}: no runs of single trajectories in it; leave out --each"
+            )
         if not args.is_given("traj"):  # those of the run
             return dict.fromkeys(single if args.each else [args.resume], args)
     names = arguments.trajectories_by_name(args.traj)

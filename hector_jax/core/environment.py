@@ -15,10 +15,12 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
+from hector_jax.core.numerics import without_our_flag
+
 # modules that do not affect numerical results
 _NO_NUMBERS = (
     "control.weights_file core.console core.environment core.files core.identity core.inputs"
-    " core.runtime core.tree_file"
+    " core.runtime core.tree_file runs.cache runs.folder runs.setup"
 ).split()
 _NUMERICS = "core.numerics"  # JAX's options, on which all numbers depend
 # imported names whose package has another name or brings another package that computes
@@ -85,9 +87,9 @@ def code_hash(*modules: str) -> str:
     """Return a hash (12 hexadecimal digits) of the code and packages that determine a result.
 
     It covers the syntax trees, without docstrings, of the modules, of every module of this package
-    that they import and of the one that sets JAX's options, and the versions of all other packages
-    that these import. Comments, layout and modules that only read, write and print do not change
-    it.
+    that they import and of the one that sets JAX's options, the versions of all other packages
+    that these import, and XLA_FLAGS. Comments, layout and modules that only read, write and print
+    do not change it.
 
     Args:
         modules: names such as `sim.walk`, relative to this package.
@@ -101,7 +103,8 @@ def code_hash(*modules: str) -> str:
         trees[name], imported, others = _syntax(_source(name).read_bytes())
         pending += imported
         packages |= others
-    content = sorted(trees.items()), _installed(sorted(packages))
+    flags = without_our_flag(os.environ.get("XLA_FLAGS", ""))
+    content = sorted(trees.items()), _installed(sorted(packages)), flags
     return hashlib.sha256(repr(content).encode()).hexdigest()[:12]
 
 

@@ -53,6 +53,10 @@ def _broken_package(error: Exception) -> str:
         named = _package(error.name or "")
     elif isinstance(error, AttributeError) and isinstance(error.obj, ModuleType):
         named = _package(error.obj.__name__)
+    elif isinstance(error, SyntaxError):  # of another Python
+        parts = reversed(Path(str(error.filename)).with_suffix("").parts)
+        named = next((x for x in parts if x.isidentifier() and _file_of(x)), "")
+        error, is_ours = ImportError(str(error), name=named), named == _package(__name__)
     suspects = [named]
     if not is_ours and any(frame.f_code.co_name == "<module>" for frame in frames):
         suspects += [last, *sorted(map(_package, sys.modules))]  # one may break another

@@ -72,11 +72,17 @@ def not_used() -> dict[str, str]:
 def _defaults() -> dict[str, Any]:
     """Return JAX's defaults, which only a process without the variables knows."""
     program = "import pickle, sys, jax; sys.stdout.buffer.write(pickle.dumps(jax.config.values))"
-    return pickle.loads(subprocess.check_output([sys.executable, "-c", program]))
+    # -P: without the working directory, where a file may have the name of a module
+    return pickle.loads(subprocess.check_output([sys.executable, "-P", "-c", program]))
+
+
+def without_our_flag(flags: str) -> str:
+    """Return XLA_FLAGS as the user set them."""
+    return " ".join(word for word in flags.split() if _YNNPACK not in word)
 
 
 def without_ynnpack() -> None:
-    """Turn off XLA's YNNPACK on the CPU; call before JAX starts, which reads XLA_FLAGS once.
+    """Turn off XLA's _YNNPACK on the CPU; call before JAX starts, which reads XLA_FLAGS once.
 
     Its sums read memory that nothing has written: with jaxlib 0.12 a third of the programs of the
     plain net gave NaN, and 0.10.2 has wrong sums (jax-ml/jax issue 39103). An unknown flag ends a

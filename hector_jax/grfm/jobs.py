@@ -57,7 +57,7 @@ def draw_jobs(
             path = paths[int(rng.integers(len(paths)))]
             weights = _point(path, int(rng.integers(len(path.Q.euler))))
         else:
-            weights = _draw_weights(rng, centres[centre], SPREAD)
+            weights = _draw_weights(rng, centres[centre])
         return _draw_job(rng, i, command, weights, seconds=seconds, robot=robot)
 
     return [draw(i) for i in range(count)]
@@ -82,8 +82,8 @@ def _draw_job(
     return Job(weights, command, plant, seconds, seed=i, push=push)
 
 
-def _draw_weights(rng: np.random.Generator, centre: Weights, spread: float) -> Weights:
-    return jax.tree.map(lambda w: w * spread ** rng.uniform(-1.0, 1.0, w.shape), centre)
+def _draw_weights(rng: np.random.Generator, centre: Weights) -> Weights:
+    return jax.tree.map(lambda w: w * SPREAD ** rng.uniform(-1.0, 1.0, w.shape), centre)
 
 
 def _draw_push(rng: np.random.Generator, seconds: float, scale: float) -> Push:

@@ -76,7 +76,8 @@ def walker_hash(robot: Robot) -> str:
     What only begins or judges one may change: weights, loss, limits of a fall, plants.
     """
     d = robot.description
-    parts = d.standing, d.joints, d.linkage, d.weld, d.armature, d.feet, d.control
+    feet = tuple(map(tuple, d.feet))
+    parts = d.standing, d.joints, d.linkage, d.weld, d.armature, feet, d.control
     return hashlib.sha256(repr(parts).encode() + d.model.read_bytes()).hexdigest()[:16]
 
 

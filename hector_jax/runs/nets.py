@@ -32,7 +32,7 @@ from hector_jax.runs.tunings import TUNING_CODE, compile_programs, tune_config, 
 from hector_jax.sim.engine import ENGINES, choose_engine
 
 # modules that determine the numbers, for `code_hash`
-TRAINING_CODE = ("grfm.training",)
+TRAINING_CODE = ("runs.nets", "grfm.training")
 COLLECTION_CODE = (*TUNING_CODE, "grfm.collection", "grfm.jobs", "sim.walk", "sim.parallel")
 
 
@@ -208,9 +208,10 @@ def load_net(path: Path, robot: Robot, variant: str) -> tuple[TrainedNet, dict[s
 
 def training_settings(config: TrainConfig, robot: Robot) -> dict[str, Any]:
     """Return all inputs of a net other than its walks, as JSON values for its card."""
+    phi = network.VARIANTS[config.variant]
     return {
         **asdict(config),
-        "functions": [function_id(f) for f in network.VARIANTS[config.variant][2:5]],
+        "functions": [function_id(f) for f in (phi.init, phi.fit, phi.apply)],
         "touchdown_error": robot.description.tuning.touchdown_error,
         "code": code_hash(*TRAINING_CODE),
     }

@@ -37,7 +37,7 @@ from hector_jax.tuning.loss import loss_of_robot
 from hector_jax.tuning.rollout import rollout_config
 
 # modules that determine the numbers, for `content_key`
-TUNING_CODE = ("tuning.difftune", "grfm.network")
+TUNING_CODE = ("runs.tunings", "tuning.difftune", "grfm.network")
 
 
 class Problem(NamedTuple):

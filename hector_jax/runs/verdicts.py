@@ -29,7 +29,7 @@ from hector_jax.sim.world import Imperfections
 from hector_jax.tuning.rollout import rollout, rollout_config
 
 # modules that determine the numbers, for `content_key`
-_CODE = ("sim.diagnosis", "runs.metrics")
+_CODE = ("runs.verdicts", "sim.diagnosis", "runs.metrics")
 
 Case = tuple[str | int, ...]
 """Labels of a walk, the last the seed of its plant."""

@@ -142,13 +142,12 @@ def read_history(campaign: Campaign) -> list[Row]:
         "plants": [plant and tree_hash(plant) for plant in campaign.plants],
         "seed": campaign.seed,
         "leg_numbers": list(campaign.leg_numbers),
-        "methods": list(campaign.methods),
-        "grounded": campaign.grounded,
     }
     if campaign.reported:  # data: neither code nor loss can make them those of another campaign
         settings = {"seconds": campaign.seconds, "numbers": list(campaign.numbers)}
         head |= {"robot": walker_hash(campaign.robot), "settings": settings}
     else:
+        head |= {"methods": list(campaign.methods), "grounded": campaign.grounded}
         head |= {"engine": engine.key, "code": code_hash("runs.walks", *engine.modules)}
 
     def parse(row: Mapping[str, Any]) -> Row:
