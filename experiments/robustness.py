@@ -221,7 +221,7 @@ def report(
     }
     return write_report(
         folder / "report.md",
-        f"How much the weight sets survive on {flags.scenes.traj}",
+        f"How much the weight sets survive on {flags.scenes.traj}, {world}",
         paragraphs,
         numbers=numbers,
         json_name="robustness.json",

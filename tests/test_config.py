@@ -92,6 +92,12 @@ def test_what_is_written_is_read_as_it_was(tmp_path, kind):
     assert "config" not in as_table(asked)
 
 
+def test_the_table_of_a_line_has_the_fields_of_its_command_only():
+    table = as_table(from_line(["tune", "--seeds", "3"]))
+    assert table == as_table(Tune(seeds=3))
+    assert table.keys() == {field.name for field in fields(Tune)} - {"config"}
+
+
 def test_the_line_that_asks_again_needs_no_file(tmp_path):
     found = parsed("tune", "--config", written(tmp_path, 'traj = "s"\n'), "--seeds", "4")
     assert parse.as_command("hector tune", found) == "hector tune --traj s --seeds 4"

@@ -494,6 +494,52 @@ def test_the_table_of_the_search_over_many_plants_is_that_of_its_walks():
     assert f"is {of_weights} (weights) and {of_all} % (all)" in page
 
 
+def readme():
+    return " ".join((ROOT / "README.md").read_text().split())
+
+
+def test_the_falls_under_pushes_of_the_readme_are_those_of_their_files():
+    files = [DOCS / "robustness" / name / "robustness.json" for name in COMMANDS]
+    levels = [json.loads(path.read_text())["levels"] for path in files]
+
+    def falls(name, force):
+        return sum(each[f"push {force} N"]["sets"][name]["falls"] for each in levels)
+
+    names = ("expert", "best", "integral", "shared_mean")
+    told = [f"`{name}` in {falls(name, 100)} and {falls(name, 125)}" for name in names]
+    first = f"`nominal` falls in {falls('nominal', 100)} and {falls('nominal', 125)}"
+    assert ", ".join([first, *told]) in readme()
+    floor = json.loads((DOCS / "robustness/standin-s/robustness.json").read_text())["levels"]
+    falls_on = {name: one["falls"] for name, one in floor["friction 0.5"]["sets"].items()}
+    assert (
+        "of 30 walks `nominal` falls in {nominal}, `expert` in {expert}, `best` and `integral` in "
+        "{best}, `shared_mean` in {shared_mean} "
+    ).format(**falls_on) in readme()
+    assert falls_on["integral"] == falls_on["best"]
+
+
+def test_the_control_loss_of_the_readme_is_that_of_the_results():
+    """Means over plants against that of expert, whole and between the switches of stance."""
+    more, times = {}, {}
+    for trajectory in COMMANDS:
+        table = json.loads((DOCS / "results/seeds-1000/table.json").read_text())
+        sets = dict(table["trajectories"][trajectory]["sets"])
+        for folder in ("best", "many-plants"):
+            path = DOCS / "results" / folder / f"{trajectory}.json"
+            sets |= json.loads(path.read_text())["sets"]
+        whole = {name: one["standin"]["L_ctrl"]["mean"] for name, one in sets.items()}
+        rest = {n: x - sets[n]["standin"]["L_ctrl_switching"] for n, x in whole.items()}
+        for name in sets:
+            more.setdefault(name, []).append(100 * (whole[name] / whole["expert"] - 1))
+            times.setdefault(name, []).append(rest[name] / rest["expert"])
+    names = ("best", "integral", "with", "search")
+    whole = [f"{min(more[n]):.0f} to {max(more[n]):.0f} % with `{n}`" for n in names]
+    rest = [f"`{n}` {min(times[n]):.2g} to {max(times[n]):.2g}" for n in names[1:]]
+    assert f"{', '.join(whole[:3])} and {whole[3]}." in readme()
+    assert f"3.3 to 3.8 times those of `expert`, of {', of '.join(rest)}." in readme()
+    assert (min(times["best"]), max(times["best"])) == pytest.approx((3.3, 3.8), abs=0.05)
+
+
 def test_the_falls_of_best_are_those_of_their_file():
     scenes = json.loads((DOCS / "results/best/falls-8-15.json").read_text())["scenes"]
     page = " ".join((DOCS / "results.md").read_text().split())

@@ -133,7 +133,7 @@ AROUND = {
     "property": "class C:\n    k = property(lambda self: K)\nc = C()\ndef f(x): return c.k * x",
     "range": "r = range(int(K))\ndef f(x): return len(r) * x",
     "path": "p = Path(str(K))\ndef f(x): return p",
-    "other name": "a, b = jax.numpy.sin, jax.numpy.cos\nc = a if K < 2.5 else b\ndef f(x): return c(x)",
+    "other name": "a, b = np.sin, np.cos\nc = a if K < 2.5 else b\ndef f(x): return c(x)",
 }
 IMPORTS = """
 from pathlib import Path

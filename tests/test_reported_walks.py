@@ -4,6 +4,7 @@ The logs are drawn, not walked: what is tried here is what the folder makes of t
 """
 
 import json
+import sys
 from contextlib import nullcontext, suppress
 from dataclasses import replace
 from functools import partial
@@ -17,6 +18,7 @@ from test_walks import HandsOver
 
 from hector_jax.cli import evaluate, parse, propose
 from hector_jax.cli.flags import Propose, Report, Walk
+from hector_jax.cli.main import main
 from hector_jax.control.trajectories import load_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import load_weights, save_weights
@@ -140,6 +142,20 @@ def refused(folder, words, *logs, **flags):
         report(folder, *logs, **flags)
     assert "\n" not in str(error.value)
     assert content(folder) == before
+
+
+def test_a_campaign_goes_on_by_the_line(folder, robot, monkeypatch, capsys):
+    def typed(*words):
+        monkeypatch.setattr(sys, "argv", ["hector", *map(str, words)])
+        assert main() == 0, capsys.readouterr().err
+
+    typed("propose", folder, "--traj", "ahead.toml", "--tune", "foot_height", "--seed", 3)
+    for number in range(2):
+        if number:
+            typed("propose", folder)
+        typed("report", folder, carded(folder, robot, "ahead", number=number))
+    typed("report", folder, "--undo")
+    assert len(walks.read_history(campaign(folder))) == 1
 
 
 # Whose log it is

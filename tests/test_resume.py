@@ -508,3 +508,5 @@ def test_runs_of_each_trajectory_are_resumed_together(tmp_path, monkeypatch):
         ("c", ("c",)),
         ("s", ("s",)),
     ]
+    with pytest.raises(InputError, match="c: no runs of single trajectories in it; leave out --e"):
+        command.tune(line("--each", "--resume", tmp_path / "run" / "c"))
