@@ -511,7 +511,7 @@ def test_every_help_tells_each_flag_and_gives_an_example(monkeypatch, capsys, pr
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_completion_prints_a_script_that_knows_the_commands(monkeypatch, capsys, tmp_path, shell):
     with pytest.raises(SystemExit) as left:
-        call(monkeypatch, "completion", shell)
+        call(monkeypatch, "--tyro-print-completion", shell)
     assert left.value.code in (0, None)
     script = capsys.readouterr().out
     for word in ("evaluate", "--first-seed", "hfs-varied", "--config"):
@@ -572,7 +572,7 @@ def test_a_reader_that_has_enough_is_no_error():
         [
             "bash",
             "-c",
-            f"{sys.executable} -m hector_jax.cli.main completion bash | head -n 1; "
+            f"{sys.executable} -m hector_jax.cli.main --tyro-print-completion bash | head -n 1; "
             f"{sys.executable} -c 'from hector_jax.core.console import exit_code; "
             'exit(exit_code("x", lambda: print("y\\n" * 99999)))\' | head -n 1; '
             "exit ${PIPESTATUS[0]}",

@@ -95,19 +95,6 @@ for module in ("robot.model", "sim.parallel", "report.view"):
     assert done.returncode == 0, done.stderr
 
 
-def test_a_home_that_cannot_be_written_is_told_in_one_line(tmp_path):
-    wall = tmp_path / "wall"
-    wall.write_text("a file, where a folder is wanted")
-    places = {"XDG_CACHE_HOME": str(wall), "TMPDIR": str(tmp_path), "MPLCONFIGDIR": str(wall)}
-    no_renderer = {"MUJOCO_GL": "crayon"}  # of which nothing is said, as there is no film
-    done = hector("compare", tmp_path, env=USUAL | places | no_renderer)
-    told = f"{wall}/hector_jax/jax cannot be written: compiled programs are kept in {tmp_path}/"
-    said = [line for line in done.stderr.splitlines() if line != "loading JAX and MuJoCo"]
-    assert said[0].startswith(told)
-    assert len(said) == 2
-    assert "result.json: cannot read" in said[1]
-
-
 def test_a_cache_whose_name_is_not_utf8_is_told_in_one_line(tmp_path):
     environment = USUAL | {"XDG_CACHE_HOME": os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9")}
     done = hector("walk", env=environment)

@@ -13,7 +13,6 @@ from synthetic import synthetic_walk
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.gait import GaitConfig
 from hector_jax.core.trajectory import Wrench
-from hector_jax.core.tree_file import read_card, save_tree
 from hector_jax.grfm import paper, residual
 from hector_jax.grfm.dataset import ACROSS, ALONG, at_interval, make_dataset, with_mirror
 from hector_jax.grfm.effect import HISTORY, Window, last_command
@@ -225,29 +224,6 @@ def test_a_net_of_another_size_comes_back(tmp_path, data, robot):
         save_net(tmp_path / "net.npz", small, robot=robot, about={})
         again, _, _ = load_net(tmp_path / "net.npz", robot)
         jax.tree.map(np.testing.assert_array_equal, again, small)
-
-
-def test_a_net_from_a_file_of_the_old_names_comes_back(tmp_path, ensemble, robot):
-    """The statistics were called `usual` and the residual's RMS `left`."""
-    path = tmp_path / "net.npz"
-    save_net(path, ensemble, robot=robot, about={})
-    about = read_card(path)["about"]
-    fields = ensemble._asdict()
-    old = {"usual": fields.pop("stats"), "left": fields.pop("residual_rms"), **fields}
-    save_tree(path, old, kind="grfm-residual", robot=robot, about=about)
-    jax.tree.map(np.testing.assert_array_equal, load_net(path, robot)[0], ensemble)
-
-
-def test_a_net_of_a_file_without_touchdowns_lands_as_planned(tmp_path, ensemble, robot):
-    path = tmp_path / "net.npz"
-    save_net(path, ensemble, robot=robot, about={})
-    about = read_card(path)["about"]
-    old, as_planned = (
-        ensemble._replace(linear=ensemble.linear._replace(touchdown=leaf))
-        for leaf in (None, jnp.zeros_like(ensemble.linear.touchdown))
-    )
-    save_tree(path, old, kind="grfm-residual", robot=robot, about=about)
-    jax.tree.map(np.testing.assert_array_equal, load_net(path, robot)[0], as_planned)
 
 
 def test_a_net_of_another_variant_is_refused_by_name(tmp_path, params, robot):

@@ -34,17 +34,6 @@ def test_the_cache_lies_in_the_users_cache_folder(monkeypatch, tmp_path):
     assert not any(folder.iterdir())  # the probe is gone
 
 
-def test_a_home_that_cannot_be_written_has_its_cache_elsewhere(monkeypatch, tmp_path):
-    wall, elsewhere = tmp_path / "wall", tmp_path / "elsewhere"
-    wall.write_text("a file, where a folder is wanted")
-    elsewhere.mkdir()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(wall))
-    monkeypatch.setattr(runtime.tempfile, "gettempdir", lambda: str(elsewhere))
-    folder = runtime.cache_folder()
-    assert folder.is_dir()
-    assert folder.is_relative_to(elsewhere)
-
-
 def test_importing_the_library_leaves_jax_alone_and_computes_nothing():
     told = (
         "import jax, hector_jax.tuning.difftune, hector_jax.core.runtime\n"

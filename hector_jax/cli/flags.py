@@ -377,16 +377,6 @@ class Compare(Flags):
     json: bool = False  # print JSON instead of the table
 
 
-@_command
-class Completion(Flags):
-    """Print the script that completes `hector` in a shell.
-
-    Example: hector completion bash > ~/.local/share/bash-completion/completions/hector
-    """
-
-    shell: Literal["bash", "zsh", "fish"]  # shell to write the script for
-
-
 def command(word: str) -> type[Any]:
     """Return the class of a command's flags.
 

@@ -15,10 +15,10 @@ from hector_jax.core.inputs import InputError, outside_packages
 
 try:
     with outside_packages():
-        from hector_jax.cli.flags import Completion, Doctor, Export
-        from hector_jax.cli.parse import all_commands, check, from_line, resolve_latest
-        from hector_jax.core.console import Broken, exit_code, say, say_if_slow
-        from hector_jax.core.runtime import cache_folder, home_cache, start_jax
+        from hector_jax.cli.flags import Doctor, Export
+        from hector_jax.cli.parse import check, from_line, resolve_latest
+        from hector_jax.core.console import Broken, exit_code, say_if_slow
+        from hector_jax.core.runtime import start_jax
 except InputError as error:
     print(f"hector: {error}", file=sys.stderr)
     sys.exit(2)
@@ -32,12 +32,8 @@ def main() -> int:
 def _run(words: Sequence[str]) -> None:
     args = resolve_latest(from_line(words))
     check(args)
-    if isinstance(args, Completion):
-        all_commands("--tyro-print-completion", args.shell)
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # hides messages about its cache
     try:
-        if (cache := cache_folder()) != (default := home_cache()):
-            say(f"{default} cannot be written: compiled programs are kept in {cache}")
         with say_if_slow("loading JAX and MuJoCo"):
             start_jax(on_cpu=isinstance(args, Export))  # an export refuses a GPU
             with outside_packages():  # after the flags: `hector --help` answers at once

@@ -37,6 +37,7 @@ _ABOUT = (
     "Exit codes: 0 done, 1 something is broken, 2 bad input, 130 interrupted."
 )
 _HELP = ("-h", "--help")
+_COMPLETION = "--tyro-print-completion"
 _LATEST = Path("latest")  # stands for the newest run
 _MAX_BYTES = 1_000_000
 _NUMBERS: dict[Any, str] = {int: "a whole number", float: "a number"}
@@ -59,8 +60,8 @@ def from_line(words: Sequence[str]) -> Any:
     """
     helps = [word for word in words if word in _HELP]
     name, *rest = [word for word in words if word not in _HELP] or [""]
-    if helps and not name:
-        return all_commands("--help")
+    if (helps and not name) or name == _COMPLETION:
+        return _all_commands(words)
     return read_flags(command(name), [*rest, *helps], f"hector {name}")
 
 
@@ -83,8 +84,8 @@ def read_flags(kind: type[Flags], words: Sequence[str], program: str) -> Flags:
     return with_given(_quietly(kind, words, **options), (x.replace("-", "_") for x in given))
 
 
-def all_commands(*words: str) -> Any:
-    """Run tyro's own flags, such as --help, on all commands; exits by SystemExit."""
+def _all_commands(words: Sequence[str]) -> Any:
+    """Run tyro's own flags on all commands; exits by SystemExit."""
     kinds = [Annotated[kind, tyro.conf.subcommand(name)] for name, kind in COMMANDS.items()]
     return _tyro(Union[tuple(kinds)], words, prog="hector", description=_ABOUT)  # noqa: UP007
 

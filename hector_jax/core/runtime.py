@@ -31,40 +31,23 @@ from hector_jax.core.numerics import pin_options
 _LEAST_MEMORY = 3e9  # [B] of address space: JAX alone takes 1.3 GB, compiling a walk 2.3 GB
 
 
-def home_cache() -> Path:
-    """Return the folder of the compilation cache in the user's home."""
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return Path(base) / "hector_jax" / "jax"
-
-
 def cache_folder() -> Path:
-    """Return the folder of the compilation cache; a temporary one if the home is not writable.
+    """Return the folder of the compilation cache, which is made.
 
     Raises:
-        InputError: no folder exists that only this user can write, or its name is not UTF-8.
+        InputError: it cannot be written, or its name is not UTF-8.
     """
-    folder = home_cache()
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    folder = Path(base) / "hector_jax" / "jax"
+    check_utf8("XDG_CACHE_HOME or the folder of the cache", str(folder))  # JAX takes no other name
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        own = Path(tempfile.gettempdir()) / f"hector_jax-{os.getuid()}"
-        try:
-            own.mkdir(mode=0o700, exist_ok=True)
-        except OSError:
-            raise InputError(
-                f"no folder for compiled programs: {folder}: {error.strerror}, and {own} cannot "
-                "be made; set XDG_CACHE_HOME to a folder that can be written"
-            ) from None
-        # compiled programs are executed: no other user may have written them
-        if own.is_symlink() or own.stat().st_uid != os.getuid() or own.stat().st_mode & 0o077:
-            raise InputError(
-                f"{own} is open to others or of another user, so no programs are loaded from it; "
-                "remove it, or set XDG_CACHE_HOME to a folder that can be written"
-            ) from None
-        folder = own / "jax"
-        folder.mkdir(exist_ok=True)
-    check_utf8("XDG_CACHE_HOME or the folder of the cache", str(folder))  # JAX takes no other name
+        raise InputError(
+            f"no folder for compiled programs: {folder}: {error.strerror}; "
+            "set XDG_CACHE_HOME to a folder that can be written"
+        ) from None
     return folder
 
 

@@ -27,7 +27,6 @@ VARIANTS = {phi.name: phi for phi in (RESIDUAL, PAPER, GATED, LINEAR)}
 
 Params = Any  # of a variant: `Phi.params`
 _MAX_LAYERS, _MAX_WIDTH = 8, 4096  # hidden layers and their units in a file
-_IN_OLD_FILES = {"stats": "usual", "residual_rms": "left"}
 
 
 def variant_of(params: Params) -> Phi:
@@ -97,27 +96,11 @@ def load_net(
             with a number that is not finite.
     """
     name, card = read_net_card(path, variant)
-    zeros = layout(name, tuple(card["about"]["hidden"]), walk_config(robot))
-    arrays = card.get("arrays")
-    arrays = arrays if isinstance(arrays, dict) else {}
-    like = jax.tree_util.tree_map_with_path(
-        lambda path, leaf: leaf if _is_in_file(path, arrays) else None, zeros
-    )
-    old = _IN_OLD_FILES if "left" in arrays else {}
-    fields = {field: old.get(field, field) for field in like._fields}
-    tree = {fields[field]: leaf for field, leaf in like._asdict().items()}
-    tree, card = load_tree(path, tree, kind=card["kind"], robot=robot)
-    params = like._replace(**{field: tree[entry] for field, entry in fields.items()})
-    params = jax.tree.map(lambda zero, leaf: zero if leaf is None else leaf, zeros, params)
+    like = layout(name, tuple(card["about"]["hidden"]), walk_config(robot))
+    params, card = load_tree(path, like, kind=card["kind"], robot=robot)
     if not all(np.isfinite(p).all() for p in jax.tree.leaves(params)):
         raise InputError(f"{path}: a parameter of the net is not finite")
     return params, name, card
-
-
-def _is_in_file(path: Any, arrays: Any) -> bool:
-    """Return whether a file has a parameter; older files have no `touchdown`."""
-    name = jax.tree_util.keystr(path, simple=True, separator=".")
-    return not name.endswith("touchdown") or name in arrays
 
 
 def layout(variant: str, hidden: tuple[int, ...], config: WalkConfig) -> Params:

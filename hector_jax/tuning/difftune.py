@@ -32,12 +32,12 @@ from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError, short_repr, unknown
-from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, check, from_table
+from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, check
 from hector_jax.core.trajectory import Wrench
 from hector_jax.core.tree import where
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.evaluate import Evaluation, evaluate_jit
-from hector_jax.tuning.loss import PAPER_LOSS, Loss, alphas, check_loss, with_alphas
+from hector_jax.tuning.loss import PAPER_LOSS, alphas, check_loss
 from hector_jax.tuning.rollout import RolloutConfig
 from hector_jax.tuning.status import StepStatus, Stop, status_text
 
@@ -80,22 +80,6 @@ class TuneConfig:
     def as_table(self) -> dict[str, Any]:
         """Return the settings as JSON values; of the loss only its weights."""
         return asdict(replace(self, loss=PAPER_LOSS)) | {"loss": alphas(self.loss)}
-
-    @classmethod
-    def from_table(cls, where: str, table: Any, loss: Loss = PAPER_LOSS) -> "TuneConfig":
-        """Read the settings from JSON values, with the terms of a loss.
-
-        Raises:
-            InputError: one line that begins with `where`, for an unknown or wrong setting.
-        """
-        if not isinstance(table, dict) or not isinstance(table.get("loss", {}), dict):
-            return from_table(where, cls, table)  # raises the error
-        others = {name: value for name, value in table.items() if name != "loss"}
-        try:
-            weighted = with_alphas(table.get("loss", {}), loss)
-        except InputError as error:
-            raise InputError(f"{where}: loss: {error}") from None
-        return replace(from_table(where, cls, others), loss=weighted)
 
 
 def _why_not_tunable(walk: WalkConfig, name: str) -> str:
