@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import problems
+from experiments import sensitivity
 from hector_jax.control.controller import WalkConfig, walk_config
 from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.gait import GaitConfig
@@ -51,7 +52,6 @@ from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs, ideal
-from hector_jax.tuning import sensitivity
 from hector_jax.tuning.difftune import TuneConfig, tune, tune_step
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 from hector_jax.tuning.rollout import RolloutConfig, no_variation, rollout

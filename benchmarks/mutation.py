@@ -39,7 +39,7 @@ PARTS = {
     ),
     "tuning": (
         "tuning/batch tuning/difftune tuning/loss tuning/grounded tuning/rollout"
-        " tuning/sensitivity tuning/evaluate search/cmaes",
+        " tuning/evaluate search/cmaes",
         "loss variation config rollout difftune faults measured online search batch",
     ),
     "sim": (

@@ -20,7 +20,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import sensitivity
 from jaxtyping import Int
+from sensitivity import Sensitivities, no_tangents, step_sensitivities
 
 from hector_jax.control.controller import Retune, measured_feet
 from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
@@ -33,13 +35,11 @@ from hector_jax.core.settings import NOT_NEGATIVE, SHARE, Range, check
 from hector_jax.core.trajectory import Trajectory, Wrench, has_fallen
 from hector_jax.core.tree import stack
 from hector_jax.robot.model import Robot
-from hector_jax.tuning import sensitivity
 from hector_jax.tuning.difftune import Iteration, TuneConfig, step_status, step_weights
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.grounded import MeasuredState, carry_from
 from hector_jax.tuning.loss import Loss, losses
 from hector_jax.tuning.rollout import Carry, RolloutConfig, command_history
-from hector_jax.tuning.sensitivity import Sensitivities, no_tangents, step_sensitivities
 
 ESTIMATORS = ("carried", "cut", "model")
 

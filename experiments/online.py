@@ -30,6 +30,7 @@ import adaptation
 import jax
 import numpy as np
 import plots
+import sensitivity
 import tyro
 from adaptation import Adaptation, OnlineConfig, retuner
 from lib import check_names, write_report
@@ -59,8 +60,10 @@ from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 
 # modules that decide the numbers
-CODE = ("tuning.difftune", "tuning.grounded", "tuning.sensitivity", "grfm.network", "sim.walk")
-ADAPTATION = Path(adaptation.__file__).read_text()  # part of the cache keys, as CODE
+CODE = ("tuning.difftune", "tuning.grounded", "grfm.network", "sim.walk")
+ADAPTATION = [
+    Path(m.__file__).read_text() for m in (adaptation, sensitivity)
+]  # part of the cache keys, as CODE
 SETS = ("nominal", "expert", "tuned")
 WINDOW = 0.4  # [s] of the losses along a walk
 

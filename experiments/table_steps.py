@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import adaptation
 import measured
+import sensitivity
 from measured import evaluate_walk, tune_measured
 
 from hector_jax.control.reference import named_command
@@ -35,9 +36,9 @@ from hector_jax.tuning.evaluate import Evaluation
 
 # modules that decide the numbers, for `content_key`
 SEARCH_CODE = ("runs.searches", "sim.walk", "sim.parallel")
-WALKS_CODE = (*tunings.TUNING_CODE, "tuning.grounded", "tuning.sensitivity", "sim.walk")
+WALKS_CODE = (*tunings.TUNING_CODE, "tuning.grounded", "sim.walk")
 # part of the cache keys, as WALKS_CODE
-MEASURED = Path(adaptation.__file__).read_text() + Path(measured.__file__).read_text()
+MEASURED = [Path(m.__file__).read_text() for m in (adaptation, measured, sensitivity)]
 
 
 class Bench(NamedTuple):

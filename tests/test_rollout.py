@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import sensitivity
 from model import CONFIG, LEARNS_TOUCHDOWNS, PLAIN, SHORT, small_effect
 
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
@@ -15,7 +16,6 @@ from hector_jax.core.geometry import rot_z
 from hector_jax.grfm.dataset import make_dataset
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
-from hector_jax.tuning import sensitivity
 from hector_jax.tuning.difftune import (
     TuneConfig,
     init,

@@ -132,7 +132,7 @@ def _read_collection(folder: Path) -> dict[str, Any]:
     try:
         card = read_json(path, "the card of a collection")
         shards, settings = card["shards"], dict(card["settings"])
-        if not shards or not all(re.fullmatch(r"(shard|walk)-\d+\.npz", name) for name in shards):
+        if not shards or not all(re.fullmatch(r"walk-\d+\.npz", name) for name in shards):
             raise ValueError(f"shards are {short_repr(shards)}")
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: no card of a collection; collect again") from error
