@@ -15,6 +15,7 @@ Walks are kept under OUT/walks and taken up again. `--standin` adds plants of th
 for a verdict; nothing here was chosen by them.
 """
 
+import inspect
 import itertools
 import math
 import sys
@@ -62,7 +63,7 @@ from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 # modules that decide the numbers
 CODE = ("tuning.difftune", "tuning.grounded", "grfm.network", "sim.walk")
 ADAPTATION = [
-    Path(m.__file__).read_text() for m in (adaptation, sensitivity)
+    inspect.getsource(module) for module in (adaptation, sensitivity)
 ]  # part of the cache keys, as CODE
 SETS = ("nominal", "expert", "tuned")
 WINDOW = 0.4  # [s] of the losses along a walk

@@ -3,6 +3,7 @@
 Each stores its results and reads existing results.
 """
 
+import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -38,7 +39,7 @@ from hector_jax.tuning.evaluate import Evaluation
 SEARCH_CODE = ("runs.searches", "sim.walk", "sim.parallel")
 WALKS_CODE = (*tunings.TUNING_CODE, "tuning.grounded", "sim.walk")
 # part of the cache keys, as WALKS_CODE
-MEASURED = [Path(m.__file__).read_text() for m in (adaptation, measured, sensitivity)]
+MEASURED = [inspect.getsource(module) for module in (adaptation, measured, sensitivity)]
 
 
 class Bench(NamedTuple):
