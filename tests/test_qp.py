@@ -102,6 +102,19 @@ def test_walking_qps_in_32_bits_are_near_and_never_wrong_in_silence(walking, exa
     assert (error[solved] <= 0.1).all()
 
 
+def test_no_qp_of_the_benchmark_is_wrong_in_silence_in_32_bits():
+    config, robot = WalkConfig(), load_robot()
+    write = partial(jax.lax.map, partial(layer_qp, config, robot))
+    qps = jax.device_get(jax.jit(write)(draw_problems(config, robot, WALKING)))
+    single = jax.tree.map(np.float32, qps)
+    found = jax.device_get(jax.jit(partial(jax.lax.map, solve_qp))(single))
+    exact = [exact_solution(QP(*parts))[0][:5] for parts in zip(*qps, strict=True)]
+    error = np.abs(found.x[:, :5] - exact).max(axis=1)
+    solved = found.status == Status.SOLVED
+    assert error[solved].max() <= 0.1
+    assert solved.mean() >= 0.995
+
+
 @pytest.mark.parametrize(("n", "m"), SHAPES)
 def test_general_qps_are_right(n, m):
     made, found = general(n, m)
@@ -189,6 +202,11 @@ def correlated(off, q):
     return rows(P=((1.0, off), (off, 1.0)), q=q)
 
 
+def crossed(slope):
+    """A fall along a flat direction that a row of this slope ends, far away."""
+    return rows(((1.0, 1.0 - slope), -INF, 1.0), P=np.ones((2, 2)), q=(-1.0, 1.0))
+
+
 FIRST, SECOND, BOTH, HALF = (1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (0.5, 0.5)
 FLAT = ((1.0, 0.0), (0.0, 0.0))
 EDGES = {
@@ -245,7 +263,13 @@ EDGES = {
     "a fall along a direction with little curvature": (
         lambda t: correlated(1.0 - t, (1.0, -1.0)),
         (0.0, 1e-12, Status.UNBOUNDED),
+        (1e-9, Status.NOT_UNIQUE),
         (3e-8, 1e-6, Status.SOLVED),
+    ),
+    "a row that crosses a flat direction": (
+        crossed,
+        (0.0, -1e-11, -1e-9, -1e-6, -1e-3, Status.UNBOUNDED),
+        (1e-3, Status.SOLVED),
     ),
     "curvature": (
         lambda t: correlated(1.0 - t, (1.0, 1.0)),
@@ -301,6 +325,64 @@ def test_a_verdict_changes_at_its_threshold_and_the_derivative_with_it(name):
             assert np.isfinite(moved).all()
             if status != Status.SOLVED:
                 assert not np.asarray(moved).any()
+
+
+@pytest.mark.parametrize(("small", "large"), [(1e-10, 1e10), (1e-16, 1e16), (1e-100, 1e100)])
+def test_a_curvature_counts_however_large_the_others_are(small, large):
+    for diagonal in ([small, large], [large, small]):
+        found = solve(rows(P=np.diag(diagonal), q=(-1.0, -1.0)))
+        check_solved(found)
+        np.testing.assert_allclose(found.x, 1.0 / np.array(diagonal), rtol=1e-12)
+
+
+@pytest.mark.parametrize("end", [1e-11, 1e-10, 1e-9, 1e-8])
+def test_a_fall_that_ends_far_away_is_not_called_unbounded(end):
+    for qp in (correlated(1.0 - end, (1.0, -1.0)), crossed(end)):
+        assert solve(qp).status in (Status.NOT_UNIQUE, Status.INACCURATE)
+
+
+def in_decades(seed):
+    """A QP of five variables in units from 1e-8 to 1e8 and twelve rows, in turn of each kind.
+
+    Also its status, the units and, if P is definite, the minimiser in these units.
+    """
+    rng, kind = np.random.default_rng(seed), seed % 8
+    M, w, v = rng.normal(size=(5, 5)), rng.normal(size=5), rng.normal(size=5)
+    v /= np.linalg.norm(v)
+    P, flat, unit = M @ M.T + np.eye(5), np.eye(5) - np.outer(v, v), np.eye(5)
+    D = 10.0 ** rng.permutation(np.linspace(-8.0, 8.0, 5))
+    A, lower, upper = np.zeros((12, 5)), np.full(12, -INF), np.full(12, INF)
+    status = Status.SOLVED
+    if kind in (1, 2):  # bounds of the variables
+        A[:5], upper[:5] = np.diag(D), 0.1 * D
+        lower[:5] = -upper[:5]
+    if kind == 2:  # and rows of several
+        A[5:], upper[5:] = rng.normal(size=(7, 5)), 0.1
+    if kind in (3, 4, 5):
+        P, w = flat @ P @ flat, flat @ w
+        status = Status.NOT_UNIQUE
+    if kind in (4, 5):
+        w, status = w - v, Status.UNBOUNDED
+    if kind == 5:
+        A[0], upper[0], status = v, 3.0, Status.SOLVED
+    if kind == 6:
+        P = 2.0 * np.ones((5, 5)) - unit
+        status = Status.BAD_DATA
+    if kind == 7:  # one variable has no price
+        P[0], P[:, 0], w[0] = 0.0, 0.0, np.abs(w[0])
+        A[0], lower[0] = unit[0], -2.0
+    scaled = QP(P / np.outer(D, D), w / D, A / D, lower, upper)
+    x = exact_solution(QP(P, w, A, lower, upper))[0] if kind < 3 else None
+    return scaled, status, D, x
+
+
+def test_curvature_is_judged_in_units_of_the_variables():
+    cases = [in_decades(seed) for seed in range(EACH)]  # SHAPES[2]
+    found = solve_all([qp for qp, *_ in cases])
+    np.testing.assert_array_equal(found.status, [status for _, status, *_ in cases])
+    for found_x, (_, _, D, x) in zip(found.x, cases, strict=True):
+        if x is not None:
+            np.testing.assert_allclose(found_x / D, x, atol=1e-10 * np.abs(x).max())
 
 
 def test_a_row_of_rounding_is_a_row_of_zeros():
@@ -684,7 +766,9 @@ def test_on_a_gpu_each_verdict_of_a_batch_is_that_of_the_cpu(dtype, error, monke
     flat = QP(P, 5.0 * P[0], np.eye(9, 5), -one, one)
     saddle, nan = flat._replace(P=2.0 * P - np.eye(5)), flat._replace(q=np.full(5, np.nan))
     cases = [(flat, Status.NOT_UNIQUE), *map(of_kind, range(30, 36))]
-    cases += [(saddle, Status.BAD_DATA), (nan, Status.BAD_DATA)]
+    size = 10.0 ** np.array([-5, -2, 0, 2, 5])  # x is 1 / size
+    decades = QP(np.diag(size**2), -size, flat.A, -1e6 * one, 1e6 * one)
+    cases += [(saddle, Status.BAD_DATA), (nan, Status.BAD_DATA), (decades, Status.SOLVED)]
     qps = stack([qp._replace(A=qp.A[None]) for qp, _ in cases])  # one block
     qps = jax.tree.map(lambda part: part.astype(dtype), qps)
     cpu = jax.jit(jax.vmap(solve_qp))(qps)

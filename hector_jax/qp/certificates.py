@@ -5,6 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 from jax import lax
+from jax.scipy.linalg import cho_solve
 
 from hector_jax.core.arrays import Array
 from hector_jax.qp.linear import cholesky, largest, matvec, multiplier, plus_gram, rmatvec
@@ -77,8 +78,7 @@ def rays(tolerances: Tolerances, qp: Normal, before: Point, point: Point) -> tup
     gap = -jnp.sum(SIGN * qp.bound * growth + (growth - rise) / tolerances.certificate)
     # differences of products that an iteration computes at both points anyway
     pull = rmatvec(qp.A, multiplier(point.z)) - rmatvec(qp.A, multiplier(before.z))
-    outside = SIGN * (matvec(qp.A, point.x) - matvec(qp.A, before.x))
-    outward = jnp.where(qp.equality, jnp.abs(outside), jnp.where(qp.side, outside, 0.0))
+    outward = qp.outward(matvec(qp.A, point.x) - matvec(qp.A, before.x))
     change = jnp.maximum(largest(qp.P @ point.x - qp.P @ before.x), jnp.max(outward, initial=0.0))
     # if P is definite the objective is bounded
     residual = jnp.stack([largest(pull), jnp.where(qp.flat, change, jnp.inf)])
@@ -91,13 +91,45 @@ def certificates(tolerances: Tolerances, qp: Normal, before: Point, point: Point
     The proof has to exceed rounding and the tolerance, within which the problem can be solved.
     """
     dx, rise = point.x - before.x, point.z - before.z
-    rows = jnp.sum(jnp.abs(rise) * qp.row_sizes(point.x))
-    sizes = jnp.stack([rows, jnp.sum(jnp.abs(dx)) * qp.slope_size(point)])
     residual, threshold = rays(tolerances, qp, before, point)
-    A, x = jnp.abs(qp.A), jnp.abs(point.x)
-    terms = largest(rmatvec(A, jnp.sum(jnp.abs(point.z), axis=0)))
-    rounding = jnp.finfo(x.dtype).eps * jnp.stack(
-        [terms, jnp.maximum(largest(jnp.abs(qp.P) @ x), largest(matvec(A, x)))]
-    )
-    certain = residual + rounding < threshold
-    return certain & (threshold > tolerances.certificate * tolerances.residual * sizes)
+    terms = rmatvec(jnp.abs(qp.A), jnp.sum(jnp.abs(point.z), axis=0))
+    rounding = jnp.finfo(dx.dtype).eps * largest(terms)
+    size = jnp.sum(jnp.abs(rise) * qp.row_sizes(point.x))
+    infeasible = residual[0] + rounding < threshold[0]
+    infeasible &= threshold[0] > tolerances.certificate * tolerances.residual * size
+    may_fall, least = residual[1] < threshold[1], tolerances.residual * qp.slope_size(point)
+    test = lambda operands: _falls(tolerances, *operands)  # noqa: E731
+    return jnp.stack([infeasible, only_if(may_fall, test, may_fall, (qp, dx, least))])
+
+
+def _falls(tolerances: Tolerances, qp: Normal, step: Array, least: Array) -> Array:
+    """Return whether a step contains a descent that P and rows limit by no more than rounding.
+
+    A step to infinity also has a part of finite size, which P or a row limits. It is removed first;
+    nothing remains of a step with curvature. The slope of the rest has to exceed `least`.
+    """
+    # far above rounding, which would otherwise turn one flat direction into another
+    P = qp.P + tolerances.rounding**0.5 * jnp.eye(len(step), dtype=step.dtype)
+
+    def measure(d: Array) -> tuple[Array, Array]:
+        size = jnp.sum(jnp.abs(d))
+        return size, jnp.max(qp.outward(matvec(qp.A, d)), axis=0) > tolerances.rounding * size
+
+    def remove(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        d, held, _ = state
+        weight = held.astype(d.dtype)
+        factor = cholesky(plus_gram(P, qp.A, weight))
+
+        def reduce(_: Array, d: Array) -> Array:
+            limited = qp.P @ d + rmatvec(qp.A, weight * matvec(qp.A, d))
+            return d - cho_solve((factor, True), limited)
+
+        d = lax.fori_loop(0, 3, reduce, d)
+        crossed = measure(d)[1] & ~held
+        return d, held | crossed, jnp.any(crossed)
+
+    start = step / jnp.sum(jnp.abs(step)), qp.equality, jnp.ones((), bool)
+    d, *_ = lax.while_loop(lambda state: state[-1], remove, start)
+    size, crossed = measure(d)
+    flat = (largest(qp.P @ d) <= tolerances.rounding * size) & ~jnp.any(crossed)
+    return flat & (-jnp.dot(qp.q, d) > least * size)

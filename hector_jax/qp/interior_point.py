@@ -105,7 +105,8 @@ def _advance(fixed: _Fixed, limit: int, state: _Loop) -> _Loop:
     point, slack = where(finite, new, (state.point, state.slack))
     factors = jnp.where(finite, 0.1, jnp.array([10.0, 100.0], dtype))
     proximal = jnp.maximum(factors * state.proximal, least)
-    converged = jnp.max(qp.residuals(point)) <= tolerances.target
+    residuals = qp.inner_residuals(point)
+    converged = jnp.max(residuals) <= tolerances.target
     iterations = state.iterations + 1
     residual, threshold = rays(tolerances, qp, state.point, point)
     running = ~converged & ~jnp.any(residual < threshold) & (proximal[0] < 1.0)
@@ -149,15 +150,15 @@ def approach(
 
     def attempt(state: tuple) -> tuple:
         best, (size, slope), _ = state
-        scaled = qp._replace(
-            P=size / slope * qp.P, q=qp.q / slope, bound=qp.bound / size, reach=qp.reach / size
-        )
+        first = best.iterations == 0
+        # a step that was no ray at first stops no second attempt
+        scaled = qp._replace(P=size / slope * qp.P, q=qp.q / slope, flat=qp.flat & first)
+        scaled = scaled._replace(bound=qp.bound / size, reach=qp.reach / size)
         point, slack, certified, iterations = interior_point(
             tolerances, scaled, enabled, max_iterations=max_iterations
         )
         point = Point(size * point.x, slope * point.z)
-        residuals = qp.residuals(point)
-        first = best.iterations == 0
+        residuals = qp.inner_residuals(point)
         better = first | (jnp.max(residuals) < jnp.max(best.residuals))
         before = best.point, best.slack, best.residuals
         point, slack, residuals = where(better, (point, size * slack, residuals), before)

@@ -37,4 +37,5 @@ def box_osqp(
     point = Point(x, z)
     certified = certificates(tolerances, qp, jax.tree.map(jnp.zeros_like, point), point)
     slack = jnp.maximum(-qp.violation(x), 0.0)
-    return Approach(point, slack, qp.residuals(point), certified, state.iter_num.astype(jnp.int32))
+    residuals = qp.inner_residuals(point)
+    return Approach(point, slack, residuals, certified, state.iter_num.astype(jnp.int32))

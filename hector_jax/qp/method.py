@@ -14,10 +14,11 @@ Status. All conditions are comparisons in the normalised problem; t is the toler
   by more than its own rounding. Or a row of zeros, or a row with l > u, is violated by more than t
   for every x.
 - UNBOUNDED: P is not positive definite, and a step of x proves a descent that neither P nor a row
-  limits, by more than t and by more than its own rounding.
+  limits, by more than t and by more than its own rounding: it contains a ray d with q'd < 0 where
+  P d and what A d leaves the bounds by are at most 1e-12 of the sum of |d|.
 - BAD_DATA: a number is not finite, or P + 1e-9 I is not positive definite.
 
-(In 32 bits: 1e-5 and 1e-6 for 1e-8 and 1e-9.)
+(In 32 bits: 1e-5, 1e-6 and 1e-6 for 1e-8, 1e-9 and 1e-12.)
 """
 
 from collections.abc import Callable
