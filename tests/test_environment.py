@@ -99,10 +99,9 @@ def test_a_cache_whose_name_is_not_utf8_is_told_in_one_line(tmp_path):
     environment = USUAL | {"XDG_CACHE_HOME": os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9")}
     done = hector("walk", env=environment)
     assert done.returncode == 2
-    assert done.stderr.startswith(
-        "hector: XDG_CACHE_HOME or the folder of the cache must be in UTF-8"
-    )
-    assert done.stderr.count("\n") == 1
+    *loading, line = done.stderr.splitlines()
+    assert line.startswith("hector: XDG_CACHE_HOME or the folder of the cache must be in UTF-8")
+    assert loading in ([], ["loading JAX and MuJoCo"])  # if it takes long
 
 
 # Streams and signals

@@ -312,8 +312,9 @@ def test_without_any_place_for_a_cache_a_command_ends_in_one_line(tmp_path):
     text = (
         f"no folder for compiled programs: {wall}/.cache/hector_jax/jax: Not a directory; set XDG"
     )
-    assert ran.stderr.startswith(f"hector: {text}_CACHE_HOME")
-    assert len(ran.stderr.splitlines()) == 1
+    *loading, line = ran.stderr.splitlines()
+    assert line.startswith(f"hector: {text}_CACHE_HOME")
+    assert loading in ([], ["loading JAX and MuJoCo"])  # if it takes long
 
 
 # hector tune --resume
