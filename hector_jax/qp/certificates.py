@@ -97,39 +97,31 @@ def certificates(tolerances: Tolerances, qp: Normal, before: Point, point: Point
     size = jnp.sum(jnp.abs(rise) * qp.row_sizes(point.x))
     infeasible = residual[0] + rounding < threshold[0]
     infeasible &= threshold[0] > tolerances.certificate * tolerances.residual * size
-    may_fall, least = residual[1] < threshold[1], tolerances.residual * qp.slope_size(point)
-    test = lambda operands: _falls(tolerances, *operands)  # noqa: E731
-    return jnp.stack([infeasible, only_if(may_fall, test, may_fall, (qp, dx, least))])
+    falls = _falls(tolerances, qp, dx, residual[1] < threshold[1], qp.slope_size(point))
+    return jnp.stack([infeasible, falls])
 
 
-def _falls(tolerances: Tolerances, qp: Normal, step: Array, least: Array) -> Array:
+def _falls(tolerances: Tolerances, qp: Normal, step: Array, enabled: Array, size: Array) -> Array:
     """Return whether a step contains a descent that P and rows limit by no more than rounding.
 
     A step to infinity also has a part of finite size, which P or a row limits. It is removed first;
-    nothing remains of a step with curvature. The slope of the rest has to exceed `least`.
+    nothing remains of a step with curvature. `size` is that of a slope; if not `enabled` nothing is
+    computed.
     """
     # far above rounding, which would otherwise turn one flat direction into another
-    P = qp.P + tolerances.rounding**0.5 * jnp.eye(len(step), dtype=step.dtype)
+    shift = tolerances.rounding**0.5
+    P = qp.P + shift * jnp.eye(len(step), dtype=step.dtype)
 
-    def measure(d: Array) -> tuple[Array, Array]:
-        size = jnp.sum(jnp.abs(d))
-        return size, jnp.max(qp.outward(matvec(qp.A, d)), axis=0) > tolerances.rounding * size
+    def remove(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        d, held, *_ = state
+        factor = cholesky(plus_gram(P, qp.A, held.astype(d.dtype)))
+        # multiplies the part of curvature c by shift / (shift + c)
+        d = lax.fori_loop(0, 3, lambda _, d: shift * cho_solve((factor, True), d), d)
+        length = jnp.sum(jnp.abs(d))
+        crossed = jnp.max(qp.outward(matvec(qp.A, d)), axis=0) > tolerances.rounding * length
+        flat = largest(qp.P @ d) <= tolerances.rounding * length
+        falls = flat & ~jnp.any(crossed) & (-jnp.dot(qp.q, d) > tolerances.residual * size * length)
+        return d, held | crossed, jnp.any(crossed & ~held), falls
 
-    def remove(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        d, held, _ = state
-        weight = held.astype(d.dtype)
-        factor = cholesky(plus_gram(P, qp.A, weight))
-
-        def reduce(_: Array, d: Array) -> Array:
-            limited = qp.P @ d + rmatvec(qp.A, weight * matvec(qp.A, d))
-            return d - cho_solve((factor, True), limited)
-
-        d = lax.fori_loop(0, 3, reduce, d)
-        crossed = measure(d)[1] & ~held
-        return d, held | crossed, jnp.any(crossed)
-
-    start = step / jnp.sum(jnp.abs(step)), qp.equality, jnp.ones((), bool)
-    d, *_ = lax.while_loop(lambda state: state[-1], remove, start)
-    size, crossed = measure(d)
-    flat = (largest(qp.P @ d) <= tolerances.rounding * size) & ~jnp.any(crossed)
-    return flat & (-jnp.dot(qp.q, d) > least * size)
+    start = step / jnp.sum(jnp.abs(step)), qp.equality, enabled, jnp.zeros((), bool)
+    return lax.while_loop(lambda state: state[2], remove, start)[3]
