@@ -239,19 +239,46 @@ def input_weights(weights: Weights) -> Float[Array, " u"]:
     return pack_wrench(Wrench(force, moment if moment.size else jnp.zeros_like(force)))
 
 
-def cost(
-    config: MpcConfig, problem: MpcProblem, condensed: Condensed
-) -> tuple[Float[Array, "n n"], Float[Array, "N b"]]:
-    """Return half of P and half of q. Source: Eq. 3."""
+def half_slope(
+    config: MpcConfig, problem: MpcProblem, condensed: Condensed, v: Float[Array, "N b"]
+) -> Float[Array, "N b"]:
+    """Return half of P v + q, without forming P. Source: Eq. 3."""
     robot, parameters, _, horizon, _ = problem
-    feet, G, turn, push, angles, later, travel, free = condensed
-    N, b, dtype = config.horizon, G.shape[-1], later.dtype
+    _, G, turn, push, angles, later, travel, free = condensed
     Q, R = parameters.weights.Q, input_weights(parameters.weights)
-    error = jax.tree.map(lambda x, target, w: w * (x - target), free, horizon.reference, Q)
-    effort = contract("kui,u,kuj->kij", G, R, G)
-    empty = jnp.repeat(1.0 - feet.sum(-1), config.contact_model.inputs, axis=-1)
-    effort = effort + jax.vmap(jnp.diag)(empty)
+    turned, pushed = (contract("kxb,kb->kx", change, v) for change in (turn, push))
+    moved = State(
+        contract("kjxy,jy->kx", angles, turned), travel @ pushed, later @ turned, later @ pushed
+    )
+    states = jax.tree.map(jnp.add, free, moved)
+    error = jax.tree.map(lambda x, target, w: w * (x - target), states, horizon.reference, Q)
+    torque = contract("kjxy,kx->jy", angles, error.euler)
+    torque = torque + contract("kj,kx->jx", later, error.ang_velocity)
+    force = contract("kj,kx->jx", travel, error.position)
+    force = force + contract("kj,kx->jx", later, error.velocity)
+    share = robot.mass * robot.gravity[2] / jnp.maximum(horizon.contact.sum(-1), 1)
+    up = np.zeros((2, horizon.contact.shape[1], 3))  # forces and moments
+    up[0, :, 2] = 1.0
+    weight = share[:, None] * jnp.asarray(up.ravel(), later.dtype)
+    effort = contract("kui,ki->ku", G, v) - parameters.effort_reference * weight
+    slope = contract("jxb,jx->jb", turn, torque) + contract("jxb,jx->jb", push, force)
+    return slope + contract("kui,u,ku->ki", G, R, effort) + _no_foot(config, condensed) * v
 
+
+def _no_foot(config: MpcConfig, condensed: Condensed) -> Float[Array, "N b"]:
+    """Return 1 for the inputs of contacts without a foot, else 0."""
+    return jnp.repeat(1.0 - condensed.feet.sum(-1), config.contact_model.inputs, axis=-1)
+
+
+def half_hessian(
+    config: MpcConfig, problem: MpcProblem, condensed: Condensed
+) -> Float[Array, "n n"]:
+    """Return half of P. Source: Eq. 3."""
+    _, G, turn, push, angles, later, travel, _ = condensed
+    N, b = config.horizon, G.shape[-1]
+    weights = problem.parameters.weights
+    Q, R = weights.Q, input_weights(weights)
+    effort = contract("kui,u,kuj->kij", G, R, G) + jax.vmap(jnp.diag)(_no_foot(config, condensed))
     wide = jnp.swapaxes(angles, 1, 2).reshape(3 * N, 3 * N)  # rows: step and angle
     overlap = later.T @ later  # number of steps that two inputs both affect
     turning = wide.T @ (jnp.tile(Q.euler, N)[:, None] * wide)
@@ -259,18 +286,7 @@ def cost(
     spin = block_diagonal(turn)
     pushing = overlap[..., None] * Q.velocity + (travel.T @ travel)[..., None] * Q.position
     pushed = contract("ixa,ixjb->iajb", push, contract("ijx,jxb->ixjb", pushing, push))
-    P = spin.T @ (turning @ spin) + pushed.reshape(N * b, N * b) + block_diagonal(effort)
-    torque = contract("kjxy,kx->jy", angles, error.euler)
-    torque = torque + contract("kj,kx->jx", later, error.ang_velocity)
-    force = contract("kj,kx->jx", travel, error.position)
-    force = force + contract("kj,kx->jx", later, error.velocity)
-    q = contract("jxb,jx->jb", turn, torque) + contract("jxb,jx->jb", push, force)
-    share = robot.mass * robot.gravity[2] / jnp.maximum(horizon.contact.sum(-1), 1)
-    up = np.zeros((2, horizon.contact.shape[1], 3))  # forces and moments
-    up[0, :, 2] = 1.0
-    weight = share[:, None] * jnp.asarray(up.ravel(), dtype)
-    q = q - parameters.effort_reference * contract("kui,u,ku->ki", G, R, weight)
-    return P, q
+    return spin.T @ (turning @ spin) + pushed.reshape(N * b, N * b) + block_diagonal(effort)
 
 
 def input_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> Rows:
@@ -320,8 +336,8 @@ def state_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> 
 
 def build_qp(
     config: MpcConfig, problem: MpcProblem, *, dt: float, max_contacts: int
-) -> tuple[QP, Float[Array, "u b"]]:
-    """Build the MPC as a condensed QP, and the map from the first step's inputs to u_0.
+) -> tuple[QP, Condensed]:
+    """Build the MPC as a condensed QP, and the states as functions of its inputs.
 
     Args:
         config: shape of the problem.
@@ -331,24 +347,30 @@ def build_qp(
 
     Returns:
         QP in the inputs of all steps, n = N b with b inputs of `max_contacts` feet; its rows are
-        block-diagonal by step (N, rows, b), or dense with constraints on states. G_0 in
-        u_0 = G_0 v_0.
+        block-diagonal by step (N, rows, b), or dense with constraints on states.
 
     Source: Eq. 3, 4.
     """
     condensed = condense(config, problem, dt, max_contacts)
-    P, q = cost(config, problem, condensed)
+    P = half_hessian(config, problem, condensed)
+    q = half_slope(config, problem, condensed, jnp.zeros_like(condensed.push[:, 0]))
     A, lower, upper = input_rows(config, problem, condensed)
     if config.on("states"):
         parts = Rows(block_diagonal(A), lower, upper), state_rows(config, problem, condensed)
         A, lower, upper = map(jnp.concatenate, zip(*parts, strict=True))
-    return QP(2.0 * P, 2.0 * q.reshape(-1), A, lower, upper), condensed.inputs[0]
+    return QP(2.0 * P, 2.0 * q.reshape(-1), A, lower, upper), condensed
 
 
 def solve_mpc(
     config: MpcConfig, problem: MpcProblem, *, dt: float, max_contacts: int
 ) -> tuple[Wrench, Solution]:
     """Solve the MPC; return the first step's wrench [N, N m], world frame, and the QP solution."""
-    qp, first = build_qp(config, problem, dt=dt, max_contacts=max_contacts)
-    solution = solve_qp(qp, config.qp)
+    qp, condensed = build_qp(config, problem, dt=dt, max_contacts=max_contacts)
+
+    def slope(x: Float[Array, " n"]) -> Float[Array, " n"]:
+        v = x.reshape(config.horizon, -1)
+        return 2.0 * half_slope(config, problem, condensed, v).ravel()
+
+    first = condensed.inputs[0]
+    solution = solve_qp(qp, config.qp, slope)
     return unpack_wrench(contract("ub,b->u", first, solution.x[: first.shape[1]])), solution

@@ -12,59 +12,67 @@ without status SOLVED. (In 32 bits the matrix of a minimiser that is almost not 
 Cholesky factor; the derivative is then NaN.)
 """
 
+from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
-from jax.custom_derivatives import SymbolicZero
 from jax.scipy.linalg import cho_solve
 
+from hector_jax.core.arrays import Array
 from hector_jax.qp.linear import cholesky, matvec, plus_gram, rmatvec
 from hector_jax.qp.method import QpConfig, solve_normal
-from hector_jax.qp.problem import QP, Solution, Status
+from hector_jax.qp.problem import QP, Normal, Solution, Status
 
 SAVED = "qp"
 """Checkpoint name of solver results: a `jax.checkpoint` policy saves them for the reverse pass."""
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def differentiable_solve(config: QpConfig, qp: QP) -> Solution:
+class _Conditions(NamedTuple):
+    """Terms of the optimality conditions at a fixed solution, as functions of the data."""
+
+    slope: Array  # (n,) P x + q + A'y
+    rows: Array  # (m,) A x
+    l: Array  # (m,)  # noqa: E741
+    u: Array  # (m,)
+
+
+def differentiable_solve(
+    config: QpConfig, qp: QP, slope: Callable[[Array], Array] | None = None
+) -> Solution:
     """Solve a QP with symmetric P by `solve_normal`, with the derivative of this module."""
-    return solve_normal(config, qp)[0]
+    found = solve_normal(config, jax.lax.stop_gradient(qp))
+    solution, ratio = checkpoint_name(found[:2], SAVED)
+    pull = qp.P @ solution.x + qp.q if slope is None else slope(solution.x)
+    pull = pull + rmatvec(qp.A, solution.y)
+    conditions = _Conditions(pull, matvec(qp.A, solution.x), qp.l, qp.u)
+    return _follow(config, (solution, ratio, found[2]), conditions)
 
 
-def _nonzero(tangent: Any) -> bool:
-    return not isinstance(tangent, SymbolicZero)
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _follow(
+    config: QpConfig, found: tuple[Solution, Array, Normal], conditions: _Conditions
+) -> Solution:
+    """Return the solution, with the derivative that keeps the conditions fulfilled."""
+    return found[0]
 
 
-@partial(differentiable_solve.defjvp, symbolic_zeros=True)
-def _jvp(config: QpConfig, primals: tuple[QP], tangents: tuple[QP]) -> tuple[Solution, Solution]:
-    (qp,), (d,) = primals, tangents
-    solution, ratio, normal = solve_normal(config, qp)
-    solution, ratio = checkpoint_name((solution, ratio), SAVED)
-    dtype = qp.q.dtype
+@_follow.defjvp
+def _jvp(config: QpConfig, primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
+    (solution, ratio, normal), d = primals[0], tangents[1]
+    dtype = solution.x.dtype
     tolerances = config.tolerances(dtype)
     column, row = normal.column, normal.row
     weight = ratio[0] + ratio[1]
     capped = weight >= tolerances.cap
-    eye = jnp.eye(len(qp.q), dtype=dtype)
+    eye = jnp.eye(len(solution.x), dtype=dtype)
     factor = cholesky(plus_gram(normal.P + tolerances.proximal * eye, normal.A, weight))
     solved = solution.status == Status.SOLVED
-    pull, shift = jnp.zeros_like(solution.x), jnp.zeros_like(solution.y)
-    if _nonzero(d.P):
-        pull += d.P @ solution.x
-    if _nonzero(d.q):
-        pull += d.q
-    if _nonzero(d.A):
-        pull, shift = pull + rmatvec(d.A, solution.y), shift + weight * matvec(d.A, solution.x)
-    if _nonzero(d.u):
-        shift -= ratio[0] * d.u
-    if _nonzero(d.l):
-        shift -= ratio[1] * d.l
-    pull, shift = jnp.where(solved, column * pull, 0.0), jnp.where(solved, row * shift, 0.0)
+    shift = weight * d.rows - ratio[0] * d.u - ratio[1] * d.l
+    pull, shift = jnp.where(solved, column * d.slope, 0.0), jnp.where(solved, row * shift, 0.0)
     dv, dz = jnp.zeros_like(pull), jnp.zeros_like(shift)
     for _ in range(2):  # as in `active_set`, the second pass removes the bias of cap and rho
         force = jnp.where(capped, dz, 0.0) + weight * matvec(normal.A, dv) + shift

@@ -1,18 +1,31 @@
 """The public functions: `solve_qp`, and `check_solved` for its solutions."""
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 import numpy as np
 
+from hector_jax.core.arrays import Array
 from hector_jax.qp.derivative import differentiable_solve
 from hector_jax.qp.method import QpConfig
 from hector_jax.qp.problem import QP, Solution, Status
 
 
-def solve_qp(qp: QP, config: QpConfig = QpConfig()) -> Solution:  # noqa: B008
+def solve_qp(
+    qp: QP,
+    config: QpConfig = QpConfig(),  # noqa: B008
+    slope: Callable[[Array], Array] | None = None,
+) -> Solution:
     """Solve a QP; differentiable in both modes, for jit and vmap, in the dtype of the data.
 
     Never raises on values and never returns a NaN: `status` qualifies the solution (`check_solved`
     checks it).
+
+    Args:
+        qp: the data.
+        config: the method.
+        slope: x (n,) -> P x + q, with the data's derivative. Where P is costly to differentiate, a
+            product with it that forms no matrix makes the derivative cheap; by default P @ x + q.
 
     Raises:
         ValueError: the shapes do not match.
@@ -29,7 +42,7 @@ def solve_qp(qp: QP, config: QpConfig = QpConfig()) -> Solution:  # noqa: B008
     dtype = jnp.result_type(*qp, jnp.float32)
     P, q, A, lower, upper = (jnp.asarray(v, dtype) for v in qp)
     # only the symmetric part of P matters; taking it here makes the derivative consistent
-    return differentiable_solve(config, QP(0.5 * (P + P.T), q, A, lower, upper))
+    return differentiable_solve(config, QP(0.5 * (P + P.T), q, A, lower, upper), slope)
 
 
 def check_solved(solution: Solution) -> None:
