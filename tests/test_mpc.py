@@ -488,8 +488,8 @@ def test_a_batch_is_a_loop():
 
 def test_u_is_packed_forces_first():
     state, horizon = problem(3)
-    _, first = write(CONFIG, expert(), state, horizon, 1)
-    wrench = unpack_wrench(first @ jnp.array([1.0, 2.0, 3.0, 0.0, 5.0]))
+    _, condensed = write(CONFIG, expert(), state, horizon, 1)
+    wrench = unpack_wrench(condensed.inputs[0] @ jnp.array([1.0, 2.0, 3.0, 0.0, 5.0]))
     np.testing.assert_allclose(wrench.force, [[1, 2, 3], [0, 0, 0]])
     np.testing.assert_allclose(wrench.moment, [[0, 0, 5], [0, 0, 0]])
 

@@ -17,7 +17,7 @@ from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import BASELINES, Tune, Walk
 from hector_jax.cli.parse import as_command
 from hector_jax.cli.verdict import small_verdict
-from hector_jax.control.parameters import leg_numbers, model_numbers
+from hector_jax.control.parameters import leg_numbers, model_numbers, step_names
 from hector_jax.control.reference import Command
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import Weights, expert, nominal
@@ -41,8 +41,8 @@ from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.runs.walks import Campaign, Row, candidates, changes, tune_on_walks
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.world import hfs
-from hector_jax.tuning.curvature import main_directions
-from hector_jax.tuning.difftune import Tuning
+from hector_jax.tuning.curvature import Determined, determined
+from hector_jax.tuning.difftune import Tuning, stop_reason
 from hector_jax.tuning.evaluate import aligned
 from hector_jax.tuning.loss import smoother
 
@@ -89,6 +89,11 @@ class _Run(NamedTuple):
         config = self.setup.config
         loss = smoother(config.loss, self.args.smooth)
         return self.setup._replace(config=replace(config, loss=loss))
+
+    def determined(self, tuning: Tuning) -> Determined:
+        """Return what a tuning knows about its weights."""
+        config = self.setup.config
+        return determined(tuning.precision, config.ridge, step_names(self.start, config.others))
 
     @property
     def artefacts(self) -> Path:
@@ -151,8 +156,6 @@ def _tune_in(folder: Path, args: Tune) -> None:
             run = run._replace(setup=run.setup._replace(config=replace(config, loss=loss)))
         settings = _note_settings(run)
         tuned = _tune_sets(run)
-        inputs = run.tuning.config, robot, start, run.problems["with"]
-        matrix = pool.submit(tunings.gauss_newton_job, *inputs)  # beside the walks
         walks = _walk_sets(run, tuned.sets)
         case = trajectories[0], run.seconds, run.artefacts / "elsewhere"
         show = small_verdict(run.setup, tuned.sets, *case) if args.verdict else None
@@ -163,9 +166,10 @@ def _tune_in(folder: Path, args: Tune) -> None:
         trajectory=run.name,
         verdict=by_name[run.name],
         norms=norms,
-        curvature=main_directions(matrix.result(), start),
+        determined=run.determined(tuned.tunings["with"]),
         errors=run.net.errors,
         tunings=tuned.tunings,
+        stops={name: stop_reason(config, t.stop) for name, t in tuned.tunings.items()},
         proposals=changes(tuned.proposals),
         best_proposal=tuned.best_proposal,
         cases=len(tuned.proposals[0].losses) if tuned.proposals else 0,
@@ -231,8 +235,7 @@ def _tune_sets(run: _Run) -> _Tuned:
         "nominal": nominal(setup.robot),
         "expert": expert(setup.robot),
         **({} if run.args.start in BASELINES else {"start": run.start}),
-        **{f"{name}_ten": results[name].ten for name in run.problems},
-        **{name: tuning.converged for name, tuning in results.items()},
+        **{name: tuning.weights for name, tuning in results.items()},
         **{name: chosen.weights for name, chosen in choices.items()},
     }
     compared, pair = {name: sets[name] for name in ("nominal", *results)}, ("without", "with")
@@ -318,6 +321,9 @@ def _result(
     if tuned.choices:
         choices = tuned.choices.items()
         result["chosen"] = {name: {"iteration": c.iteration, "of": c.of} for name, c in choices}
+    found = run.determined(tuned.tunings["with"])
+    directions = [direction._asdict() for direction in found.directions]
+    result["determined"] = {"directions": directions, "weights": found.weights}
     write_json(run.folder / RESULT, result)
     return result, by_name
 

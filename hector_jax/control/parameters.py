@@ -18,12 +18,22 @@ from operator import attrgetter
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from hector_jax.control.footstep import FootstepParameters
 from hector_jax.control.legs import LegParameters
 from hector_jax.control.mpc import MpcParameters
-from hector_jax.control.weights import Weights, nominal
+from hector_jax.control.weights import (
+    Weights,
+    direction_names,
+    directions,
+    nominal,
+    scale_weights,
+    weights_to_vector,
+)
+from hector_jax.core.arrays import Array
 from hector_jax.core.settings import Range
 from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import Robot
@@ -155,3 +165,47 @@ def bounds(others: Iterable[str] = (), like: Weights | None = None) -> tuple[Wei
         )
 
     return bound("lower"), bound("upper")
+
+
+def step_names(like: Weights, others: Iterable[str] = ()) -> tuple[str, ...]:
+    """Return the names of the coordinates in which weights are stepped, see `stepped`."""
+    return (*direction_names(like), *others)
+
+
+def stepped(start: Weights, steps: Float[Array, " n"], others: Sequence[str] = ()) -> Weights:
+    """Return weights after steps from a start.
+
+    Args:
+        start: with all feet sharing one R.
+        steps: log-steps in the `weights.directions`, then of each of `others`, numbers, as shares
+            of their boxes.
+        others: names of numbers in `start.others`.
+
+    >>> start = nominal()._replace(others={"turn_lead": 0.5})
+    >>> stepped(start, np.full(19, 0.1), ["turn_lead"]).others
+    {'turn_lead': 0.7}
+    """
+    boxes, count = [TUNABLES[name] for name in others], len(direction_names(start))
+    moved = {
+        name: start.others[name] + step * (box.upper - box.lower)
+        for name, step, box in zip(others, steps[count:], boxes, strict=True)
+    }
+    scaled = scale_weights(start, steps[:count])
+    return scaled._replace(others={**start.others, **moved})
+
+
+def step_bounds(
+    start: Weights, others: Sequence[str] = ()
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Return the bounds of the steps that stay in the box, see `stepped`."""
+    first_foot = directions(start).argmax(axis=1)  # index of each direction's first weight
+
+    def steps_to(edge: Weights) -> Float[Array, " n"]:
+        logs = jnp.log(weights_to_vector(edge) / weights_to_vector(start))[first_foot]
+        widths = [TUNABLES[name].upper - TUNABLES[name].lower for name in others]
+        away = [edge.others[name] - start.others[name] for name in others]
+        shares = [change / width for change, width in zip(away, widths, strict=True)]
+        return jnp.concatenate([logs, jnp.asarray(shares, logs.dtype)])
+
+    lower, upper = bounds(others, start)
+    return steps_to(lower), steps_to(upper)

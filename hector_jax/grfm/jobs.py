@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from hector_jax.control.reference import COMMANDS, PIECES, Command, named_command, with_pieces
-from hector_jax.control.weights import Weights, expert, nominal
+from hector_jax.control.weights import Weights, between, expert, nominal
 from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import Robot
 from hector_jax.sim.loop import Job
@@ -37,7 +37,8 @@ def draw_jobs(
     Args:
         seed: of all random draws.
         count: number of walks.
-        paths: weights along tunings, each path stacked along a first axis.
+        paths: weights along tunings, each path stacked along a first axis; points are drawn on the
+            log-lines between them.
         seconds: length of each walk.
         robot: robot of the weights and plants; HECTOR by default.
 
@@ -55,7 +56,7 @@ def draw_jobs(
         centre = (i // len(KINDS)) % (3 if paths else 2)
         if centre == 2:
             path = paths[int(rng.integers(len(paths)))]
-            weights = _point(path, int(rng.integers(len(path.Q.euler))))
+            weights = _along(path, rng.uniform(0.0, len(path.Q.euler) - 1))
         else:
             weights = _draw_weights(rng, centres[centre])
         return _draw_job(rng, i, command, weights, seconds=seconds, robot=robot)
@@ -63,8 +64,11 @@ def draw_jobs(
     return [draw(i) for i in range(count)]
 
 
-def _point(path: Weights, index: int) -> Weights:
-    return jax.tree.map(lambda w: np.asarray(w)[index], path)
+def _along(path: Weights, position: float) -> Weights:
+    """Return weights on the line between two points of a path, counted from 0."""
+    index, next_ = int(position), min(int(position) + 1, len(path.Q.euler) - 1)
+    first, second = (jax.tree.map(lambda w, i=i: np.asarray(w)[i], path) for i in (index, next_))
+    return between(first, second, position - index)
 
 
 def _draw_job(

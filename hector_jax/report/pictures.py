@@ -48,7 +48,7 @@ def of_run(
     walks = {name: walks[name] for name in ("nominal", "expert", "with", "best")}
     compared = ("nominal", "expert", "without", "with")
     vectors = {name: np.asarray(weights_to_vector(sets[name])) for name in compared}
-    histories = {name: tunings[name].history for name in ("without", "with")}
+    histories = {name: tunings[name].iterations for name in ("without", "with")}
     path, tick = folder / "pictures", config.rollout.walk.gait.tick
     path.mkdir(exist_ok=True)
     captions = {

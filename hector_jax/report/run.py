@@ -12,7 +12,7 @@ from hector_jax.control.weights import Weights, weight_names, weights_to_vector
 from hector_jax.core.files import write_file
 from hector_jax.report.fidelity import error_rows
 from hector_jax.report.report import render
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, Tuning
+from hector_jax.tuning.difftune import Iteration, Tuning
 from hector_jax.tuning.evaluate import aligned
 
 
@@ -25,7 +25,7 @@ def write_report(folder: Path, **contents: Any) -> Path:
             trajectory, verdict: names of the trajectories; verdict of all sets on the stand-in.
             tunings: by set, `without` and `with`.
             norms: gradient norms of the terms in log-weights at nominal, by model.
-            curvature: of the loss at the starting weights.
+            determined: what the tuning `with` knows about its weights.
             errors: held-out errors of `raw`, `linear`, `net`, from `training.report`.
             proposals, best_proposal, cases: `Change`s of the tuning on walks; name of the set that
                 is `best`; number of walks per weight set.
@@ -44,9 +44,23 @@ def write_report(folder: Path, **contents: Any) -> Path:
     return folder / "report.md"
 
 
-def tuning_section(name: str, tuning: Tuning, chosen: Mapping[str, int] | None = None) -> str:
-    """Return the section of a tuning; a tuning on walks starts after the paper's iterations."""
-    values = {"name": name, "tuning": tuning, "chosen": chosen, "paper": PAPER_ITERATIONS}
+def tuning_section(
+    name: str,
+    tuning: Tuning,
+    stop: str,
+    chosen: Mapping[str, int] | None = None,
+    where: str = "on the model",
+) -> str:
+    """Return the section of a tuning.
+
+    Args:
+        name: of the set.
+        tuning: with its history.
+        stop: why it ended, see `difftune.stop_reason`.
+        chosen: the chosen iteration, if it is not the last.
+        where: the loss was computed, in words.
+    """
+    values = {"name": name, "tuning": tuning, "stop": stop, "chosen": chosen, "where": where}
     return render("tuning.md.j2", **values, refusals=_refusals, at_bounds=_at_bounds)
 
 

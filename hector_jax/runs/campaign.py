@@ -45,7 +45,7 @@ class Campaign:
     grounded: bool = True  # the model is corrected by the residuals of the best walk
 
     def __post_init__(self) -> None:
-        start = jax.tree.map(np.asarray, init(self.config, self.start).best)
+        start = jax.tree.map(np.asarray, init(self.config, self.start).start)
         start = with_leg_numbers(self.config.rollout.walk, start, self.leg_numbers)
         object.__setattr__(self, "start", start)
 

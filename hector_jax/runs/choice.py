@@ -97,7 +97,7 @@ def choose(
         return {}
     points = {}  # of each path, by their labels
     for name, tuning in tunings.items():
-        path = [iteration for iteration in tuning.history if iteration.accepted]
+        path = [iteration for iteration in tuning.iterations if iteration.accepted]
         indices = sorted({round(share * (len(path) - 1)) for share in SHARES})
         points[name] = {f"{name}-{i}" if i else "start": path[i] for i in indices}
     sets = {label: i.weights for labels in points.values() for label, i in labels.items()}

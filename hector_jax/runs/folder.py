@@ -119,7 +119,7 @@ def as_line(name: str, iteration: Iteration) -> str:
         "iteration": iteration.iteration,
         "accepted": iteration.accepted,
         "reason": iteration.reason,
-        "step": iteration.step_scale,
+        "step": iteration.step_size,
         "L": evaluation.loss,
         **evaluation.terms,
         "fallen": evaluation.fallen,
@@ -231,7 +231,7 @@ def _iteration(row: Mapping[str, Any]) -> Iteration:
             residual=number(row["residual"]),
         ),
         status=np.array(status_of(row["reason"])),
-        step_scale=number(row["step"]),
+        step_size=number(row["step"]),
     )
 
 

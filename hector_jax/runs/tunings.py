@@ -31,8 +31,8 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
 from hector_jax.tuning import difftune, evaluate
-from hector_jax.tuning.curvature import gauss_newton
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
+from hector_jax.tuning.evaluate import Objective, mean_objective
 from hector_jax.tuning.loss import loss_of_robot
 from hector_jax.tuning.rollout import rollout_config
 
@@ -55,36 +55,34 @@ class Tuned(NamedTuple):
 
 
 def artefact(setup: Setup, start: Weights) -> dict[str, Any]:
-    """Return the options of `load_or_make` for tunings, whose iterations are stacked in files."""
+    """Return the options of `load_or_make` for tunings."""
     config, empty = setup.config, np.zeros(0)
-    weights = difftune.init(config, start).best  # with the other numbers that are tuned
+    weights = difftune.init(config, start).start  # with the other numbers that are tuned
     rows = jax.tree.map(lambda w: np.zeros((0, *w.shape)), weights)
     terms = {term.name: empty for term in config.loss}
     evaluation = evaluate.Evaluation(empty, terms, rows, empty, empty)
-    history: Any = Iteration(empty, rows, evaluation, empty, empty)
-    like = Tuned(Tuning(history, weights, weights, ""), "")
-
-    def pack(tuned: Tuned) -> Any:
-        return tuned._replace(tuning=tuned.tuning._replace(history=stack(tuned.tuning.history)))
-
-    def unpack(stored: Any) -> Tuned:
-        stacked, count = stored.tuning.history, len(stored.tuning.history.iteration)
-        history = [jax.tree.map(lambda x, i=i: np.asarray(x[i]), stacked) for i in range(count)]
-        return stored._replace(tuning=stored.tuning._replace(history=history))
-
-    options = {"like": lambda _: like, "kind": "tuning", "robot": setup.robot}
-    return {**options, "pack": pack, "unpack": unpack}
+    history = Iteration(empty, rows, evaluation, empty, empty)
+    like = Tuned(Tuning(weights, np.zeros(()), np.zeros((0, 0)), np.zeros(()), history), "")
+    return {"like": lambda _: like, "kind": "tuning", "robot": setup.robot}
 
 
 def _tune_job(
     config: TuneConfig, robot: Robot, start: Weights, problem: Problem, name: str, messages: Any
 ) -> Tuning:
     """Run one tuning in a worker and put each iteration into the queue `messages`."""
-    step, models = partial(difftune.tune_step, config, robot), _models(config, robot, problem)
-    evaluations = [partial(step, **model) for model in models]
-    start = difftune.init(config, start).best  # with the other numbers that are tuned
-    mean = evaluate.mean_over_commands(evaluations, start)
-    return difftune.descend(config, start, mean, lambda i: messages.put((name, i)))
+    objective = _objective(config, robot, start, problem)
+    return difftune.descend(config, start, objective, lambda i: messages.put((name, i)))
+
+
+def _objective(config: TuneConfig, robot: Robot, start: Weights, problem: Problem) -> Objective:
+    """Return the mean over the commands of a problem, each with equal influence at the start."""
+    models = _models(config, robot, problem)
+    objectives = [difftune.model_objective(config, robot, **model) for model in models]
+    if len(objectives) == 1:
+        return objectives[0]
+    at = difftune.init(config, start).start
+    losses = np.array([float(objective.evaluate(at).loss) for objective in objectives])
+    return mean_objective(objectives, losses)
 
 
 def _models(config: TuneConfig, robot: Robot, problem: Problem) -> list[dict[str, Any]]:
@@ -161,13 +159,13 @@ def tune(
 
     def make(missing: list[str], stored: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuned]]:
         if journal is not None:  # in the order of the problems
-            journal.write({n: stored[n].tuning.history if n in stored else () for n in problems})
+            journal.write({n: stored[n].tuning.iterations if n in stored else () for n in problems})
         remaining = {name: problems[name] for name in missing}
         return _tunings(setup, start, remaining, title, on_iteration)
 
     tuned = load_or_make(paths, make, **artefact(setup, start))
     if journal is not None:
-        journal.write({name: result.tuning.history for name, result in tuned.items()})
+        journal.write({name: result.tuning.iterations for name, result in tuned.items()})
     return tuned
 
 
@@ -195,9 +193,10 @@ def gauss_newton_job(
     config: TuneConfig, robot: Robot, start: Weights, problem: Problem
 ) -> Float[np.ndarray, "n n"]:
     """Return the Gauss-Newton matrix divided by the loss, mean over the commands, in a worker."""
-    matrix_of = partial(gauss_newton, config.rollout, robot, start)
-    results = [matrix_of(**m, loss=config.loss) for m in _models(config, robot, problem)]
-    return np.mean([np.asarray(matrix) / float(loss) for loss, matrix in results], axis=0)
+    models = _models(config, robot, problem)
+    objectives = [difftune.model_objective(config, robot, **model) for model in models]
+    losses = np.array([float(objective.evaluate(start).loss) for objective in objectives])
+    return mean_objective(objectives, losses).matrix(start) / losses.mean()
 
 
 def tune_config(robot: Robot, **settings: Any) -> TuneConfig:
@@ -218,7 +217,7 @@ def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
     problems = {name: Problem((named_command(name),), None) for name in COMMANDS}
     title = "tuning paths on the rigid body, for the data"
     tuned = tune(Setup(pool, tune_config(robot), robot), problems, folder, title=title)
-    histories = [tuned[name].tuning.history for name in COMMANDS]
+    histories = [tuned[name].tuning.iterations for name in COMMANDS]
     return [stack([i.weights for i in history if i.accepted]) for history in histories]
 
 
@@ -227,8 +226,9 @@ def _prepare_tuning(
 ) -> None:
     """Compile the program of a tuning, or only trace it, so that its first call need not."""
     (model,) = _models(config, robot, Problem((command,), None))
-    step, weights = partial(difftune.tune_step, config, robot), difftune.init(config, start).best
-    jax.eval_shape(step, weights, **model) if trace_only else step(weights, **model)
+    weights = difftune.init(config, start).start
+    for function in difftune.model_objective(config, robot, **model):
+        jax.eval_shape(function, weights) if trace_only else function(weights)
 
 
 def compile_programs(

@@ -31,7 +31,8 @@ from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.robot.model import Robot
 from hector_jax.tuning import difftune
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, TuneState
+from hector_jax.tuning.curvature import gauss_newton
+from hector_jax.tuning.difftune import Iteration, TuneConfig, TuneState, Tuning
 from hector_jax.tuning.evaluate import Evaluation, evaluate
 from hector_jax.tuning.loss import PAPER_LOSS, Loss
 from hector_jax.tuning.parallel_rollout import parallel_rollout
@@ -39,7 +40,7 @@ from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
 from hector_jax.tuning.status import Stop
 
 AXIS = "problems"
-PER_CALL = PAPER_ITERATIONS + 1  # rollouts per problem and call of the device: start and ten
+PER_CALL = 11  # evaluations per problem and call of the device: start and ten
 TICKS_AT_ONCE = 8 * 400  # most on a GPU that are faster at once than in turn
 
 COMPILER_OPTIONS = {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
@@ -64,17 +65,6 @@ class Problem(NamedTuple):
     start: Weights
     scenarios: Scenario  # one leading axis
     tail: Float[Array, "*batch"]  # share of the scenarios, worst first: 1 the mean, 0 the worst
-
-
-class Tunings(NamedTuple):
-    """Results of a batch of tunings; the first axis is the problem."""
-
-    ten: Weights
-    converged: Weights
-    loss: Float[np.ndarray, " problems"]  # of the converged weights
-    stop: Int[np.ndarray, " problems"]  # a `status.Stop`
-    iterations: Int[np.ndarray, " problems"]  # of each problem, without the start
-    history: Iteration  # (problems, iterations + 1); zero after the end
 
 
 def tail_weights(losses: Float[Array, " n"], tail: Float[Array, ""]) -> Float[Array, " n"]:
@@ -127,23 +117,39 @@ def _evaluate(
     robot: Robot,
     effects: jax.tree_util.Partial,
     problem: Problem,
-    weights: Weights,
-) -> Evaluation:
-    """Evaluate all scenarios of a problem as one."""
+    state: TuneState,
+) -> tuple[Evaluation, Float[Array, "n n"]]:
+    """Evaluate all scenarios of a problem as one; also return the matrix, where it is needed."""
     single = all(len(leaf) == 1 for leaf in jax.tree.leaves(effects))
+    weights = difftune.weights_at(config, state.start, state.steps)
 
-    def of_scenario(scenario: Scenario) -> Evaluation:
-        command, anchor, index, loss, scale, variation = scenario
-        effect = jax.tree.map(lambda leaf: leaf[0 if single else index], effects)
-        inputs = robot, weights, command, anchor, effect, loss, variation
-        result = evaluate(config.rollout, *inputs, walk=walk)
-        value, terms, gradient = jax.tree.map(lambda x: x / scale, result[:3])
-        return result._replace(loss=value, terms=terms, gradient=gradient)
+    def over_scenarios(function: Callable[..., Any]) -> Any:
+        def of_scenario(scenario: Scenario) -> Any:
+            command, anchor, index, loss, scale, variation = scenario
+            effect = jax.tree.map(lambda leaf: leaf[0 if single else index], effects)
+            inputs = robot, weights, command, anchor, effect, loss, variation
+            return function(scale, config.rollout, *inputs, walk=walk)
 
-    stacked = _map(lanes, of_scenario, problem.scenarios)
+        return _map(lanes, of_scenario, problem.scenarios)
+
+    def value(scale: Array, *inputs: Any, **options: Any) -> Evaluation:
+        found = evaluate(*inputs, **options)
+        loss, terms, gradient = jax.tree.map(lambda x: x / scale, found[:3])
+        return found._replace(loss=loss, terms=terms, gradient=gradient)
+
+    def curvature(scale: Array, *inputs: Any, **options: Any) -> Array:
+        return gauss_newton(*inputs, **options, others=config.others) / scale
+
+    stacked = over_scenarios(value)
     weighted_sum = partial(jnp.tensordot, tail_weights(stacked.loss, problem.tail), axes=1)
     loss, terms, gradient = jax.tree.map(weighted_sum, stacked[:3])
-    return Evaluation(loss, terms, gradient, jnp.max(stacked.fallen), jnp.max(stacked.residual))
+    checks = jnp.max(stacked.fallen), jnp.max(stacked.residual)
+    evaluation, none = Evaluation(loss, terms, gradient, *checks), jnp.zeros_like(state.rule.matrix)
+    return evaluation, jax.lax.cond(
+        difftune.needs_matrix(config, state, evaluation),
+        lambda: weighted_sum(over_scenarios(curvature)),
+        lambda: none,
+    )
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2, 3), compiler_options=COMPILER_OPTIONS)
@@ -163,8 +169,8 @@ def _advance(
         problem, start = inputs
 
         def step(state: TuneState) -> tuple[TuneState, Iteration]:
-            evaluation = _evaluate(config, lanes, walk, robot, effects, problem, state.trial)
-            return difftune.update(config, state, evaluation)
+            found = _evaluate(config, lanes, walk, robot, effects, problem, state)
+            return difftune.update(config, state, *found)
 
         def record(carry: tuple) -> tuple:
             state, history, row = carry
@@ -213,7 +219,7 @@ def tune_batch(
     lanes: int | None = None,
     walk: Callable[..., Trajectory] | None = None,
     report_progress: Callable[[int, int, str], None] = lambda done, total, message: None,
-) -> Tunings:
+) -> Tuning:
     """Tune all problems of a batch.
 
     Args:
@@ -254,7 +260,7 @@ def tune_batch(
     report_progress(0, count, f"compiling for {len(devices)} devices ({devices[0].device_kind})")
     while active:
         states, history = _advance(config, lanes, walk, mesh, robot, effects, filled, states)
-        stop, loss = _fetch((states.stop, states.loss))
+        stop, loss = _fetch((states.stop, states.rule.value))
         histories.append(_fetch(history))
         active = int(np.sum(stop[:count] == Stop.GOING))
         report_progress(count - active, count, f"median L {np.median(loss[:count]):.4g}")
@@ -262,7 +268,7 @@ def tune_batch(
     history = jax.tree.map(
         lambda *parts: np.concatenate(parts, axis=1)[:count, : config.iterations + 1], *histories
     )
-    return Tunings(final.ten, final.best, final.loss, final.stop, final.iteration - 1, history)
+    return jax.device_get(jax.vmap(partial(difftune.result, config))(final, history))
 
 
 def _check_problems(config: TuneConfig, problems: Problem, effects: jax.tree_util.Partial) -> int:

@@ -5,7 +5,7 @@ s' H s with H = J' (d2L / dw2) J, where w are the states and commands of the wal
 derivative. A direction of H with a small eigenvalue changes neither walk nor loss.
 """
 
-from functools import partial
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -13,22 +13,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from hector_jax.control.parameters import step_names, stepped
 from hector_jax.control.reference import Anchor, Command
-from hector_jax.control.weights import Weights, direction_names, scale_weights
+from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.loss import Loss, losses, total
-from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
 
 _NAMED = 0.35  # a direction is named by the weights of at least this share of its largest entry
-_FLAT = 1e-3  # a direction or weight that changes the loss by less than this share does not matter
+_FLAT = 1e-3  # a direction that changes the loss by less than this share does not matter
 
 
 class Direction(NamedTuple):
-    """A direction in the log-weights."""
+    """A direction in the coordinates of a tuning."""
 
-    change: float  # share of the loss, to second order, for a step as long as doubling a weight
+    change: float  # of the loss, to second order, for a step as long as doubling a weight
+    fixed: float  # share of the precision that is the walk's; the rest is the ridge's
     steps: dict[str, float]  # entries of the unit vector, by name of the weight
 
     @property
@@ -41,15 +43,20 @@ class Direction(NamedTuple):
         return " against ".join(", ".join(f"`{n}`" for n in side) for side in sides if side)
 
 
-class Curvature(NamedTuple):
-    """Curvature of the loss in the weights."""
+class Determined(NamedTuple):
+    """What the walk of the model determines of the weights, and what it leaves to the ridge."""
 
     directions: list[Direction]  # that matter, the strongest first
     number: int  # of all directions
-    flat: list[str]  # names of the weights that alone do not matter
+    # 1 - variance with the walk / variance of the ridge alone, of each weight
+    weights: dict[str, float]
+
+    @property
+    def left_open(self) -> list[str]:
+        """Names of the weights that the ridge determines more than the walk."""
+        return [name for name, share in self.weights.items() if share < 0.5]
 
 
-@partial(jax.jit, static_argnums=0)
 def gauss_newton(
     config: RolloutConfig,
     robot: Robot,
@@ -58,55 +65,91 @@ def gauss_newton(
     anchor: Anchor,
     effect: jax.tree_util.Partial,
     loss: Loss,
-) -> tuple[Float[Array, ""], Float[Array, "n n"]]:
-    """Return the loss of a rollout and its Gauss-Newton matrix.
+    variation: Variation | None = None,
+    walk: Callable[..., Trajectory] = rollout,
+    others: tuple[str, ...] = (),
+) -> Float[Array, "n n"]:
+    """Return the Gauss-Newton matrix of the loss of a rollout.
 
     Args:
-        config, robot, command, anchor, effect: of the rollout.
+        config, robot, command, anchor, effect, variation: of the rollout.
         weights: the point of evaluation.
         loss: terms and their weights.
+        walk: `rollout` or `parallel_rollout`.
+        others: names of numbers beside Q and R.
 
     Returns:
-        L, and the matrix in the n directions of `control.weights.directions`.
+        The matrix in the n coordinates of `parameters.stepped`.
     """
-    count = len(direction_names(weights))
+    zero = jnp.zeros(len(step_names(weights, others)))
 
-    def walk(logs: Float[Array, " n"]) -> tuple[tuple[State, Wrench], Trajectory]:
-        scaled = scale_weights(weights, logs)
-        trajectory = rollout(config, robot, scaled, command, anchor, effect)
+    def moved(steps: Float[Array, " n"]) -> tuple[tuple[State, Wrench], Trajectory]:
+        at = stepped(weights, steps, others)
+        trajectory = walk(config, robot, at, command, anchor, effect, variation)
         return (trajectory.state, trajectory.command), trajectory
 
     def tangent_of(direction: Float[Array, " n"]) -> tuple:
-        return jax.jvp(walk, (jnp.zeros(count),), (direction,), has_aux=True)
+        return jax.jvp(moved, (zero,), (direction,), has_aux=True)
 
-    point, tangents, trajectory = jax.vmap(tangent_of, out_axes=(None, 0, None))(jnp.eye(count))
+    _, tangents, trajectory = jax.vmap(tangent_of, out_axes=(None, 0, None))(jnp.eye(len(zero)))
+    return matrix_of_walk(loss, trajectory, tangents)
+
+
+gauss_newton_jit = jax.jit(gauss_newton, static_argnums=0, static_argnames=("walk", "others"))
+"""`gauss_newton`, compiled once per rollout and set of terms."""
+
+
+def matrix_of_walk(
+    loss: Loss, trajectory: Trajectory, tangents: tuple[State, Wrench]
+) -> Float[Array, "n n"]:
+    """Return the Gauss-Newton matrix from the tangents of the walk's states and commands.
+
+    Args:
+        loss: terms and their weights.
+        trajectory: the walk.
+        tangents: of `state` and `command` of the walk, with the coordinate as first axis.
+    """
 
     def objective(point: tuple[State, Wrench]) -> Float[Array, ""]:
         state, command = point
         return total(loss, losses(loss, trajectory._replace(state=state, command=command)))
 
-    gradient = jax.grad(objective)
+    gradient, point = jax.grad(objective), (trajectory.state, trajectory.command)
     products = jax.vmap(lambda tangent: jax.jvp(gradient, (point,), (tangent,))[1])(tangents)
+    count = len(jax.tree.leaves(tangents)[0])
     rows, columns = (
         jnp.concatenate([x.reshape(count, -1) for x in jax.tree.leaves(tree)], axis=1)
         for tree in (tangents, products)
     )
-    return objective(point), rows @ columns.T
+    return rows @ columns.T
 
 
-def main_directions(matrix: Float[np.ndarray, "n n"], like: Weights) -> Curvature:
-    """Find the eigenvectors that matter of a Gauss-Newton matrix divided by the loss.
+def determined(
+    precision: Float[Array, "n n"], ridge: float, names: Sequence[str]
+) -> Determined:
+    """Find what a tuning knows about its weights.
 
     Args:
-        matrix: see `gauss_newton`.
-        like: weights of its shape.
+        precision: Gauss-Newton matrix by the loss at the start, plus the ridge on the diagonal; see
+            `difftune.Tuning`.
+        ridge: of the tuning.
+        names: of the coordinates.
+
+    Source: the Gaussian (Laplace) approximation of a posterior whose prior is the ridge.
     """
-    names, of_doubling = direction_names(like), 0.5 * np.log(2.0) ** 2
-    eigenvalues, vectors = np.linalg.eigh(matrix)
+    of_doubling = 0.5 * np.log(2.0) ** 2
+    eigenvalues, vectors = np.linalg.eigh(np.asarray(precision))
+    curvatures = np.maximum(eigenvalues - ridge, 0.0)
     strongest = [
-        Direction(change, dict(zip(names, vector.tolist(), strict=True)))
-        for change, vector in zip(of_doubling * eigenvalues[::-1], vectors.T[::-1], strict=True)
-        if change > _FLAT
+        Direction(
+            of_doubling * curvature,
+            curvature / (curvature + ridge),
+            dict(zip(names, vector.tolist(), strict=True)),
+        )
+        for curvature, vector in zip(curvatures[::-1].tolist(), vectors.T[::-1], strict=True)
+        if of_doubling * curvature > _FLAT
     ]
-    changes = zip(names, of_doubling * np.diag(matrix), strict=True)
-    return Curvature(strongest, len(names), [name for name, change in changes if change < _FLAT])
+    smallest = 1e-12 * eigenvalues[-1]
+    variances = np.diag(vectors / np.maximum(eigenvalues, smallest) @ vectors.T)
+    shares = np.clip(1.0 - ridge * variances, 0.0, 1.0).tolist()
+    return Determined(strongest, len(names), dict(zip(names, shares, strict=True)))

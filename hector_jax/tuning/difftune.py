@@ -1,47 +1,61 @@
-"""DiffTune: step the weights down the gradient of the closed loop, inside the box (P, Eq. 9).
+"""DiffTune: step the weights by the derivative of the closed loop, inside the box (P, Eq. 9).
 
-theta <- P_Theta(theta - beta theta g), with g the gradient in log-weights, divided by its largest
-magnitude inside Q and inside R: a weight moves by at most beta_Q or beta_R of itself, whatever the
-size of the loss. Other numbers of the controller (`TuneConfig.others`), which may be zero, move by
-at most beta_others of the width of their box. A step that ends in a fall, a bad solve or a number
-that is not finite is rejected: the weights are reset and the step is halved.
+A tuning moves in coordinates z: log-steps of the weights from the start, all feet sharing one R,
+and steps of other numbers of the controller (`TuneConfig.others`) as shares of their box. A rule of
+`step_rules` makes the steps. The default, `gauss_newton`, minimises
 
-A tuning has two results: the weights after the paper's `ten` iterations, whose steps may raise the
-loss, and the `converged` weights, for which steps that raise the loss are rejected too until the
-loss falls no more.
+    L(z) / L(0) + ridge / 2 |z|^2
 
-`init` and `update` are this rule as functions of arrays: `tune` calls them from Python, once per
+by Gauss-Newton steps in a trust region, in about ten evaluations; `relative` and `literal` are the
+paper's gradient steps. A step that ends in a fall, a bad solve or a number that is not finite is
+refused, and so is one that gains less than a hundredth of what was predicted; the next is shorter.
+
+`init` and `update` are pure functions of arrays: `tune` calls them from Python, once per
 iteration; `batch` compiles them into its loop on the device.
 """
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Float, Int
 
 from hector_jax.control.controller import WalkConfig
-from hector_jax.control.parameters import TUNABLES, bounds, out_of_box
+from hector_jax.control.parameters import (
+    TUNABLES,
+    bounds,
+    out_of_box,
+    step_bounds,
+    step_names,
+    stepped,
+)
 from hector_jax.control.reference import Anchor, Command
-from hector_jax.control.weights import Weights, nominal
+from hector_jax.control.weights import Weights, directions, nominal, weights_to_vector
 from hector_jax.core.arrays import Array
-from hector_jax.core.inputs import InputError, short_repr, unknown
+from hector_jax.core.inputs import InputError, plural, short_repr, unknown
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, check
 from hector_jax.core.trajectory import Wrench
-from hector_jax.core.tree import where
+from hector_jax.core.tree import stack, where
 from hector_jax.robot.model import Robot
-from hector_jax.tuning.evaluate import Evaluation, evaluate_jit
+from hector_jax.tuning import step_rules
+from hector_jax.tuning.curvature import gauss_newton_jit
+from hector_jax.tuning.evaluate import Evaluation, Objective, evaluate_jit
 from hector_jax.tuning.loss import PAPER_LOSS, alphas, check_loss
 from hector_jax.tuning.rollout import RolloutConfig
 from hector_jax.tuning.status import StepStatus, Stop, status_text
+from hector_jax.tuning.step_rules import StepState
 
-PAPER_ITERATIONS = 10
+LEAST_GAIN = 5e-3
+"""Share of the objective that a Gauss-Newton step must be predicted to gain."""
+SMALLEST_STEP = 1 / 128
+"""Share of the full gradient step below which a tuning ends."""
+MISSES = 2
+"""Wrong predictions in a row after which a tuning ends: the loss is rougher than its gain."""
 
 
 @dataclass(frozen=True)
@@ -50,28 +64,24 @@ class TuneConfig:
 
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
     loss: tuple = PAPER_LOSS  # of `LossTerm`
-    beta_q: Annotated[float, POSITIVE] = 0.05  # largest relative step of a weight in Q
-    beta_r: Annotated[float, POSITIVE] = 0.08  # largest relative step of a weight in R
     others: tuple[str, ...] = ()  # names in `parameters.TUNABLES`, tuned with Q and R
-    # largest step of the others, as a share of their box
-    beta_others: Annotated[float, POSITIVE] = 0.02
-    update: str = "relative"  # or "literal": the paper's theta - beta dL/dtheta
-    tie_feet: bool = True  # one R for all feet, as the robot is its own mirror image
-    iterations: Annotated[int, AT_LEAST_ONE] = 100  # at most
-    patience: Annotated[int, AT_LEAST_ONE] = 10  # iterations in which the loss must fall
-    # by at least this share, or the tuning has converged
-    gain: Annotated[float, NOT_NEGATIVE] = 5e-3
-    # of the full step; below it the tuning has converged
-    smallest_step: Annotated[float, POSITIVE] = 1 / 128
+    rule: str = "gauss_newton"  # or the paper's: "relative", "literal" (theta - beta dL/dtheta)
+    # of "gauss_newton": share of the loss at the start, for e-folds of |z|^2 = 2
+    ridge: Annotated[float, NOT_NEGATIVE] = 0.01
+    # of the paper's rules: largest relative step of a weight in Q, in R
+    beta_q: Annotated[float, POSITIVE] = 0.05
+    beta_r: Annotated[float, POSITIVE] = 0.08
+    beta_others: Annotated[float, POSITIVE] = 0.02  # largest step of the others, share of their box
+    iterations: Annotated[int, AT_LEAST_ONE] = 10  # at most
     # largest accepted relative KKT residual: that of a solved QP
     residual: Annotated[float, POSITIVE] = 1e-8
 
     def __post_init__(self) -> None:
-        check(self, update=("relative", "literal"))
+        check(self, rule=("gauss_newton", "relative", "literal"))
         check_loss(self.loss)
         got = short_repr(self.others)
-        if self.others and self.update != "relative":
-            raise InputError(f"TuneConfig.others must be empty with update literal, got {got}")
+        if self.others and self.rule == "literal":
+            raise InputError(f"TuneConfig.others must be empty with the rule literal, got {got}")
         for name in self.others:
             if reason := _why_not_tunable(self.rollout.walk, name):
                 expected = "must be numbers that a gradient can tune"
@@ -105,14 +115,10 @@ def _why_not_tunable(walk: WalkConfig, name: str) -> str:
 class TuneState(NamedTuple):
     """State of a tuning between two rollouts."""
 
-    trial: Weights  # to be evaluated next
-    step_scale: Float[Array, "*batch"]  # share of the full step from `best` to `trial`
+    start: Weights
+    steps: Float[Array, "*batch n"]  # z, to be evaluated next
+    rule: StepState  # holds the last accepted point
     iteration: Int[Array, "*batch"]  # number of the trial; the start is 0
-    best: Weights  # the last accepted weights
-    loss: Float[Array, "*batch"]  # of `best`
-    gradient: Weights  # of `best`
-    recent: Float[Array, "*batch recent"]  # last accepted losses, newest first; NaN where none
-    ten: Weights  # best after at most the paper's ten iterations
     stop: Int[Array, "*batch"]  # a `Stop`
 
 
@@ -123,7 +129,8 @@ class Iteration(NamedTuple):
     weights: Weights
     evaluation: Evaluation
     status: Int[Array, "*batch"]  # a `StepStatus`
-    step_scale: Float[Array, "*batch"]  # share of the full step to these weights; 0 at the start
+    # radius of the trust region [e-folds], or share of the full step, to these weights; 0 at first
+    step_size: Float[Array, "*batch"]
 
     @property
     def accepted(self) -> Any:
@@ -137,12 +144,19 @@ class Iteration(NamedTuple):
 
 
 class Tuning(NamedTuple):
-    """Result of a tuning."""
+    """Result of a tuning, or with a leading axis of a batch of tunings."""
 
-    history: list[Iteration]
-    ten: Weights
-    converged: Weights
-    stop: str  # reason of the end
+    weights: Weights  # of the last accepted iteration
+    loss: Float[Array, "*batch"]  # there; infinite if the start was rejected
+    precision: Float[Array, "*batch n n"]  # matrix / loss at the start + ridge, there
+    stop: Int[Array, "*batch"]  # a `Stop`
+    history: Iteration  # (*batch, iterations + 1); in a batch zero after the end
+
+    @property
+    def iterations(self) -> list[Iteration]:
+        """The iterations of a single tuning, the start first."""
+        count = len(self.history.iteration)
+        return [jax.tree.map(lambda x, i=i: np.asarray(x[i]), self.history) for i in range(count)]
 
 
 def tune_step(
@@ -157,54 +171,44 @@ def tune_step(
     return evaluate_jit(config.rollout, robot, weights, command, anchor, effect, config.loss)
 
 
-def relative_step(
-    beta_q: float, beta_r: float, beta_others: float = 0.0
-) -> optax.GradientTransformation:
-    """Return steps downhill in log-weights; the largest relative step is beta, in Q and in R.
+def step_rule(config: TuneConfig, start: Weights) -> optax.GradientTransformationExtraArgs:
+    """Return the transformation of the rule of a config; see `step_rules`."""
+    if config.rule == "gauss_newton":
+        return step_rules.trust_region(config.ridge)
+    names = step_names(start, config.others)
+    blocks = np.array([0 if n.startswith("Q_") else 1 if n.startswith("R_") else 2 for n in names])
+    betas = np.array([config.beta_q, config.beta_r, config.beta_others])[blocks]
+    if config.rule == "relative":
+        return step_rules.relative(betas, blocks)
+    shared = directions(start)
+    return step_rules.literal(betas, shared @ jnp.square(weights_to_vector(start)))
 
-    Other numbers step by at most `beta_others` of the width of their box.
+
+def init(config: TuneConfig, weights: Weights) -> TuneState:
+    """Return the state before the first rollout.
+
+    All feet start from the geometric mean of their weights in R.
     """
-
-    def scaled(tree: Any, sizes: Any, beta: float) -> Any:
-        products = jax.tree.map(jnp.multiply, tree, sizes)
-        largest = jnp.max(jnp.abs(ravel_pytree(products)[0]), initial=0.0)
-        factor = beta / jnp.where(largest > 0.0, largest, 1.0)
-        return jax.tree.map(lambda x, size: -factor * x * size, products, sizes)
-
-    def update(updates: Any, params: Any) -> Weights:
-        if params is None:
-            raise ValueError("relative_step needs the weights: pass params to update")
-        widths = {name: TUNABLES[name].upper - TUNABLES[name].lower for name in params.others}
-        sizes = params._replace(others=widths)
-        return Weights(*map(scaled, updates, sizes, (beta_q, beta_r, beta_others)))
-
-    return optax.stateless(update)
+    weights = config.rollout.walk.with_others(weights, config.others)
+    weights = jax.tree.map(lambda w: jnp.asarray(w, float), weights)
+    equal = jnp.all(jnp.stack([jnp.all(w == w[:1]) for w in weights.R]))
+    tied = jax.tree.map(lambda w: jnp.exp(_mean_over_feet(jnp.log(w))), weights.R)
+    # equal weights stay equal to the last bit
+    weights = weights._replace(R=Wrench(*where(equal, weights.R, tied)))
+    zero = jnp.zeros(len(step_names(weights, config.others)))
+    count = jnp.asarray(0, jnp.int32)
+    rule = cast(StepState, step_rule(config, weights).init(zero))
+    return TuneState(weights, zero, rule, count, jnp.asarray(Stop.GOING, jnp.int32))
 
 
-def _optimiser(config: TuneConfig) -> optax.GradientTransformation:
-    if config.update == "relative":
-        return relative_step(config.beta_q, config.beta_r, config.beta_others)
-    rules = {"Q": optax.sgd(config.beta_q), "R": optax.sgd(config.beta_r), "": optax.set_to_zero()}
-    return optax.multi_transform(rules, Weights("Q", "R", ""))  # pyright: ignore
+def _mean_over_feet(values: Float[Array, "feet 3"]) -> Float[Array, "feet 3"]:
+    return jnp.broadcast_to(values.mean(axis=0), values.shape)
 
 
-def _mean_over_feet(R: Wrench) -> Wrench:
-    return jax.tree.map(lambda x: jnp.broadcast_to(x.mean(axis=0), x.shape), R)
-
-
-def step_weights(
-    config: TuneConfig, weights: Weights, gradient: Weights, step_scale: float | Float[Array, ""]
-) -> Weights:
-    """Step the weights downhill by `step_scale` of a full step and project them onto the box."""
-    if config.tie_feet:
-        gradient = gradient._replace(R=_mean_over_feet(gradient.R))
-    zero = jax.tree.map(jnp.zeros_like, gradient.others)
-    tuned = {name: gradient.others[name] for name in config.others}
-    gradient = gradient._replace(others={**zero, **tuned})
-    optimiser = _optimiser(config)
-    updates, _ = optimiser.update(gradient, optimiser.init(weights), weights)
-    stepped = optax.apply_updates(weights, jax.tree.map(lambda u: step_scale * u, updates))
-    return optax.projections.projection_box(stepped, *bounds(weights.others, weights))
+def weights_at(config: TuneConfig, start: Weights, steps: Float[Array, " n"]) -> Weights:
+    """Return the weights after steps z from the start of a tuning, in the box."""
+    limits = bounds(start.others, start)  # against rounding of the logarithm
+    return optax.projections.projection_box(stepped(start, steps, config.others), *limits)
 
 
 def step_status(config: TuneConfig, evaluation: Evaluation) -> Int[Array, ""]:
@@ -218,72 +222,66 @@ def step_status(config: TuneConfig, evaluation: Evaluation) -> Int[Array, ""]:
     return jnp.where(finite, status, StepStatus.NOT_FINITE).astype(jnp.int32)
 
 
-def init(config: TuneConfig, weights: Weights, first: int = 0) -> TuneState:
-    """Return the state before the first rollout, which is iteration `first`.
-
-    With `tie_feet` all feet start from the geometric mean of their weights in R.
-    """
-    weights = config.rollout.walk.with_others(weights, config.others)
-    weights = jax.tree.map(lambda w: jnp.asarray(w, float), weights)
-    if config.tie_feet:
-        equal = jnp.all(jnp.stack([jnp.all(w == w[:1]) for w in weights.R]))
-        tied = jax.tree.map(jnp.exp, _mean_over_feet(jax.tree.map(jnp.log, weights.R)))
-        # equal weights stay equal to the last bit
-        weights = weights._replace(R=where(equal, weights.R, tied))
-    return TuneState(
-        trial=weights,
-        step_scale=jnp.asarray(1.0),
-        iteration=jnp.asarray(first, jnp.int32),
-        best=weights,
-        loss=jnp.asarray(jnp.inf, float),  # of the later type, or `update` is compiled again
-        gradient=jax.tree.map(jnp.zeros_like, weights),
-        recent=jnp.full(config.patience + 1, jnp.nan, float),
-        ten=weights,
-        stop=jnp.asarray(Stop.GOING, jnp.int32),
-    )
+def trial_status(config: TuneConfig, state: TuneState, evaluation: Evaluation) -> Int[Array, ""]:
+    """Return the `StepStatus` of the trial of a state, of which this is the evaluation."""
+    status = step_status(config, evaluation)
+    if config.rule != "gauss_newton":
+        return status
+    ratio = step_rules.gain_ratio(config.ridge, state.rule, state.steps, evaluation.loss)
+    little = jnp.isfinite(state.rule.value) & ~(ratio > step_rules.LEAST)
+    return jnp.where((status == StepStatus.ACCEPTED) & little, StepStatus.NO_GAIN, status)
 
 
 def update(
-    config: TuneConfig, state: TuneState, evaluation: Evaluation
+    config: TuneConfig,
+    state: TuneState,
+    evaluation: Evaluation,
+    matrix: Float[Array, "n n"],
 ) -> tuple[TuneState, Iteration]:
     """Accept or reject the trial by its evaluation; return the next state and the iteration.
 
-    The first `PAPER_ITERATIONS` may raise the loss; later iterations must lower it. A
-    rejection halves the step, an acceptance doubles it up to the full one. After the paper's
-    iterations the tuning stops where the step has become too small or `patience` accepted
-    iterations gained less than `gain`.
+    Args:
+        config: the settings.
+        state: from `init` or the iteration before.
+        evaluation: of the trial, `weights_at(config, state.start, state.steps)`.
+        matrix: Gauss-Newton matrix at the trial; not used if that is rejected.
     """
-    iteration, start = state.iteration, jnp.isinf(state.loss)  # nothing was accepted yet
-    late = iteration > PAPER_ITERATIONS
-    status = step_status(config, evaluation)
-    rose = late & ~(evaluation.loss < state.loss)
-    status = jnp.where((status == StepStatus.ACCEPTED) & rose, StepStatus.ROSE, status)
-    accepted = status == StepStatus.ACCEPTED
+    iteration, begun = state.iteration, jnp.isfinite(state.rule.value)
+    status, believed = trial_status(config, state, evaluation), step_status(config, evaluation)
+    rule, trial = step_rule(config, state.start), weights_at(config, state.start, state.steps)
+    value = jnp.where(believed == StepStatus.ACCEPTED, evaluation.loss, jnp.inf)
+    _, pull_back = jax.vjp(lambda z: stepped(state.start, z, config.others), state.steps)
+    (gradient,) = pull_back(evaluation.gradient)
+    given = {"value": value, "matrix": matrix}
+    updates, after = rule.update(gradient, state.rule, state.steps, **given)
+    after = cast(StepState, after)
+    steps = optax.apply_updates(state.steps, updates)
+    steps = optax.projections.projection_box(steps, *step_bounds(state.start, config.others))
 
-    if_accepted = partial(where, accepted)
-    best = if_accepted(state.trial, state.best)
-    gradient = if_accepted(evaluation.gradient, state.gradient)
-    recent = if_accepted(jnp.append(jnp.asarray(evaluation.loss), state.recent[:-1]), state.recent)
-    scale = jnp.where(accepted, jnp.minimum(1.0, 2.0 * state.step_scale), state.step_scale / 2.0)
-
-    little = recent[0] > (1 - config.gain) * recent[-1]  # false while the last is NaN
     stop = jnp.where(iteration >= config.iterations, Stop.LIMIT, Stop.GOING)
-    stop = jnp.where(late & little, Stop.NO_GAIN, stop)
-    stop = jnp.where(late & (scale < config.smallest_step), Stop.SMALL_STEP, stop)
-    stop = jnp.where(start & ~accepted, Stop.BAD_START, stop)
-    after = TuneState(
-        trial=step_weights(config, best, gradient, scale),
-        step_scale=scale,
-        iteration=iteration + 1,
-        best=best,
-        loss=if_accepted(evaluation.loss, state.loss),
-        gradient=gradient,
-        recent=recent,
-        ten=jax.tree.map(lambda x, y: jnp.where(late, y, x), best, state.ten),
-        stop=stop.astype(jnp.int32),
-    )
-    scale = jnp.where(start, 0.0, state.step_scale)
-    return after, Iteration(iteration, state.trial, evaluation, status.astype(jnp.int32), scale)
+    if config.rule == "gauss_newton":
+        gain = step_rules.predicted_gain(config.ridge, after, steps)
+        least = LEAST_GAIN * step_rules.objective(config.ridge, after, after.steps, after.value)
+        stop = jnp.where(~(gain >= least), Stop.NO_GAIN, stop)
+        stop = jnp.where(after.misses >= MISSES, Stop.ROUGH, stop)
+    else:
+        stop = jnp.where(after.size < SMALLEST_STEP, Stop.SMALL_STEP, stop)
+    stop = jnp.where(~begun & (status != StepStatus.ACCEPTED), Stop.BAD_START, stop)
+    step_size = jnp.where(begun, state.rule.size, 0.0)
+    row = iteration, trial, evaluation, status, step_size
+    after = TuneState(state.start, steps, after, iteration + 1, stop.astype(jnp.int32))
+    return after, Iteration(*row)
+
+
+_update = jax.jit(update, static_argnums=0)
+
+
+def result(config: TuneConfig, state: TuneState, history: Iteration) -> Tuning:
+    """Return the result of a tuning from its last state and its iterations."""
+    rule = state.rule
+    weights = weights_at(config, state.start, rule.steps)
+    precision = rule.matrix / rule.first + config.ridge * jnp.eye(len(rule.steps))
+    return Tuning(weights, rule.value, precision, state.stop, history)
 
 
 def rejection_reason(config: TuneConfig, evaluation: Evaluation) -> str:
@@ -291,17 +289,16 @@ def rejection_reason(config: TuneConfig, evaluation: Evaluation) -> str:
     return status_text(StepStatus(int(step_status(config, evaluation))), evaluation)
 
 
-def stop_reason(config: TuneConfig, stop: Stop) -> str:
+def stop_reason(config: TuneConfig, stop: Int[Any, ""] | Stop) -> str:
     """Describe why a tuning ended."""
     return {
         Stop.GOING: "not ended",
-        Stop.LIMIT: f"{config.iterations} iterations",
+        Stop.LIMIT: plural(config.iterations, "iteration"),
         Stop.SMALL_STEP: "the step became too small to gain",
-        Stop.NO_GAIN: (
-            f"the loss fell by less than {config.gain:.1%} in {config.patience} iterations"
-        ),
+        Stop.NO_GAIN: f"the next step was predicted to gain less than {LEAST_GAIN:.1%}",
+        Stop.ROUGH: f"{MISSES} steps in a row did not gain what was predicted",
         Stop.BAD_START: "the starting weights were refused",
-    }[stop]
+    }[Stop(int(stop))]
 
 
 def tune(
@@ -324,44 +321,62 @@ def tune(
     Raises:
         InputError: the starting weights fall or cannot be solved on the model.
 
-    Source: problem P and the paper's set-up (ten iterations, beta_Q 0.05, beta_R 0.08).
+    Source: problem P.
     """
-    evaluate = partial(tune_step, config, robot, command=command, anchor=anchor, effect=effect)
-    return descend(config, weights, evaluate, on_iteration)
+    return descend(
+        config, weights, model_objective(config, robot, command, anchor, effect), on_iteration
+    )
+
+
+def model_objective(
+    config: TuneConfig,
+    robot: Robot,
+    command: Command,
+    anchor: Anchor,
+    effect: jax.tree_util.Partial,
+) -> Objective:
+    """Return the objective of a tuning on the model, see `rollout`."""
+    model = {"command": command, "anchor": anchor, "effect": effect}
+    matrix = partial(gauss_newton_jit, config.rollout, robot, loss=config.loss, **model)
+    evaluate = partial(tune_step, config, robot, **model)
+    return Objective(evaluate, partial(matrix, others=config.others))
 
 
 def descend(
     config: TuneConfig,
     weights: Weights,
-    evaluate: Callable[[Weights], Evaluation],
+    objective: Objective,
     on_iteration: Callable[[Iteration], None] = lambda iteration: None,
-    first: int = 0,
 ) -> Tuning:
-    """Minimise the loss of `evaluate` by the rule of a tuning, as a loop in Python.
+    """Minimise an objective by the rule of a tuning, as a loop in Python.
 
     Args:
         config: the settings.
         weights: the start.
-        evaluate: loss and gradient of weights.
+        objective: its matrix is taken where an iteration is accepted, by the default rule.
         on_iteration: called after each iteration.
-        first: number of the first iteration; after the paper's ten every step must lower the loss.
 
     Raises:
         InputError: the starting weights are rejected, after a call of `on_iteration`.
     """
     history: list[Iteration] = []
-    state = init(config, weights, first)
+    state, static = init(config, weights), replace(config, loss=PAPER_LOSS)  # one program for all
     while state.stop == Stop.GOING:
         # copies, because a view would keep the device's array for as long as the history
-        trial = jax.tree.map(np.array, state.trial)
-        state, iteration = update(config, state, jax.tree.map(np.array, evaluate(trial)))
+        trial = jax.tree.map(np.array, weights_at(config, state.start, state.steps))
+        evaluation, matrix = jax.tree.map(np.array, objective.evaluate(trial)), state.rule.matrix
+        if needs_matrix(config, state, evaluation):
+            matrix = objective.matrix(trial)
+        state, iteration = _update(static, state, evaluation, matrix)
         history.append(jax.tree.map(np.array, iteration))
         on_iteration(history[-1])
-    stop, last = Stop(int(state.stop)), history[-1]
-    if stop == Stop.BAD_START:
-        raise InputError(f"the starting weights cannot be tuned from: {last.reason}")
-    reason = stop_reason(config, stop)
-    if stop == Stop.SMALL_STEP and rejection_reason(config, last.evaluation):
-        reason = f"{reason}, the last refused: {last.reason}"
-    ten, converged = jax.tree.map(np.asarray, (state.ten, state.best))
-    return Tuning(history, ten, converged, reason)
+    if state.stop == Stop.BAD_START:
+        raise InputError(f"the starting weights cannot be tuned from: {history[-1].reason}")
+    return jax.tree.map(np.asarray, result(config, state, stack(history)))
+
+
+def needs_matrix(config: TuneConfig, state: TuneState, evaluation: Evaluation) -> Any:
+    """Return True if `update` uses the matrix at the trial of a state."""
+    if config.rule != "gauss_newton":
+        return False
+    return trial_status(config, state, evaluation) == StepStatus.ACCEPTED

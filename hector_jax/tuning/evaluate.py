@@ -73,32 +73,46 @@ evaluate_jit = jax.jit(evaluate, static_argnums=0, static_argnames="walk")
 need no compilation."""
 
 
+class Objective(NamedTuple):
+    """Functions of a weight set that a tuning minimises by."""
+
+    evaluate: Callable[[Weights], Evaluation]
+    matrix: Callable[[Weights], Any]  # Gauss-Newton matrix (n, n) in the steps of the tuning
+
+
 def mean_of(evaluations: Sequence[Evaluation], scales: Float[np.ndarray, " n"]) -> Evaluation:
     """Average evaluations, each divided by its scale; `fallen` and `residual` are the worst."""
     evaluations = jax.device_get(evaluations)
-
-    def mean(*values: Any) -> Any:
-        return np.mean([value / k for value, k in zip(values, scales, strict=True)], axis=0)
-
-    return jax.tree.map(mean, *evaluations)._replace(
+    return _mean(evaluations, scales)._replace(
         fallen=np.max([e.fallen for e in evaluations]),
         residual=np.max([e.residual for e in evaluations]),
     )
 
 
-def mean_over_commands(
-    evaluations: Sequence[Callable[[Weights], Evaluation]], start: Weights
-) -> Callable[[Weights], Evaluation]:
-    """Return the function that averages several evaluations, see `mean_of`.
+def _mean(trees: Sequence[Any], scales: Float[np.ndarray, " n"]) -> Any:
+    def mean(*values: Any) -> Any:
+        return np.mean([value / k for value, k in zip(values, scales, strict=True)], axis=0)
 
-    Each is divided by its share of the losses at `start`, so that all have equal influence.
+    return jax.tree.map(mean, *trees)
+
+
+def mean_objective(
+    objectives: Sequence[Objective], losses: Float[np.ndarray, " n"] | None = None
+) -> Objective:
+    """Return the mean of objectives, see `mean_of`.
+
+    Each is divided by its share of the losses, those at the start, so that all have equal
+    influence; without losses all count as they are.
     """
-    scales = np.ones(1)
-    if len(evaluations) > 1:
-        losses = np.array([evaluate(start).loss for evaluate in evaluations])
-        scales = losses / losses.mean()
+    scales = np.ones(len(objectives)) if losses is None else losses / losses.mean()
 
-    return lambda weights: mean_of([evaluate(weights) for evaluate in evaluations], scales)
+    def evaluate(weights: Weights) -> Evaluation:
+        return mean_of([objective.evaluate(weights) for objective in objectives], scales)
+
+    def matrix(weights: Weights) -> Float[np.ndarray, "n n"]:
+        return _mean([np.asarray(objective.matrix(weights)) for objective in objectives], scales)
+
+    return Objective(evaluate, matrix)
 
 
 def gradient_norms(

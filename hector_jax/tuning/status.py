@@ -12,7 +12,7 @@ class StepStatus(IntEnum):
     NOT_FINITE = 1
     FELL = 2
     UNSOLVED = 3  # a QP of the rollout
-    ROSE = 4  # the loss, after the paper's ten iterations
+    NO_GAIN = 4  # less than a hundredth of the predicted gain
 
 
 class Stop(IntEnum):
@@ -20,16 +20,17 @@ class Stop(IntEnum):
 
     GOING = 0
     LIMIT = 1  # all iterations are done
-    SMALL_STEP = 2
-    NO_GAIN = 3
-    BAD_START = 4  # the start was rejected
+    SMALL_STEP = 2  # of the paper's rules
+    NO_GAIN = 3  # too little is predicted
+    ROUGH = 4  # predictions were wrong
+    BAD_START = 5  # the start was rejected
 
 
 REASONS = {
     StepStatus.NOT_FINITE: "loss or gradient not finite",
     StepStatus.FELL: "the robot fell",
     StepStatus.UNSOLVED: "QP residual",
-    StepStatus.ROSE: "the loss rose",
+    StepStatus.NO_GAIN: "the loss did not fall as predicted",
 }
 """Beginning of the reason of each rejection."""
 

@@ -25,7 +25,7 @@ from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, label_o
 from hector_jax.report.report import caption
 from hector_jax.runs.matrix import Cells, Column, columns_of, sets_of, trajectories_of
 from hector_jax.runs.metrics import BASELINES, Verdict, compare
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration
+from hector_jax.tuning.difftune import Iteration
 from hector_jax.tuning.loss import Loss
 
 
@@ -161,13 +161,11 @@ def losses(path: Path, loss: Loss, histories: Mapping[str, Sequence[Iteration]])
     with drawing(path, 2.5 * len(parts), 2.7) as figure:
         panels = figure.subplots(1, len(parts))
         for panel, (title, part) in zip(panels, parts.items(), strict=True):
-            panel.axvline(PAPER_ITERATIONS, **style.MARK)
             for name, look in looks_of(histories).items():
                 values = np.array([float(part(step.evaluation)) for step in histories[name]]) / 1e6
                 accepted = np.array([step.accepted for step in histories[name]])
                 good, bad = np.flatnonzero(accepted), np.flatnonzero(~accepted)
-                # a marker at every iteration would hide the dashes of the line
-                marks = {"marker": look.marker, "markersize": 3.2, "markevery": 10}
+                marks = {"marker": look.marker, "markersize": 3.2}
                 panel.plot(good, values[good], **look.line, **marks, label=label_of(name))
                 if title == "$L$":
                     top = 1.1 * values[good].max()  # the loss of a rejected step may be infinite
@@ -177,7 +175,7 @@ def losses(path: Path, loss: Loss, histories: Mapping[str, Sequence[Iteration]])
         panels[0].set_ylabel("loss on the model [10$^6$]")
         if not all(step.accepted for history in histories.values() for step in history):
             panels[0].plot([], [], **cross, label="refused step")
-    return caption("losses", ten=PAPER_ITERATIONS)
+    return caption("losses")
 
 
 def weights(
