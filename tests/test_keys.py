@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import re
 import sys
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -135,16 +136,70 @@ AROUND = {
     "path": "p = Path(str(K))\ndef f(x): return p",
     "other name": "a, b = np.sin, np.cos\nc = a if K < 2.5 else b\ndef f(x): return c(x)",
 }
+VALUES = {
+    "jit": "jax.jit(lambda x: K * x)",
+    "jax array": "jnp.array(K)",
+    "dictionary": "{'k': K}",
+    "list": "[K]",
+    "nested list": "[[K], 2.0] if K < 2.5 else [[2.0, 2.0]]",
+    "deque": "deque([K])",
+    "dataclass": "D(K)",
+    "partial": "functools.partial(pow, K)",
+}
 IMPORTS = """
+import functools
+from collections import deque
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
-import jax, optax, numpy as np
+import jax, optax, jax.numpy as jnp, numpy as np
+@dataclass
+class D:
+    k: float
 """
 
 
 @pytest.mark.parametrize("text", AROUND.values(), ids=AROUND)
 def test_a_function_of_the_user_is_seen_through_what_holds_it(tmp_path, text):
     ids = [function_id(module(tmp_path, f"{IMPORTS}K = {k}\n{text}\n").f) for k in (2.0, 2.0, 3.0)]
+    assert ids[0] == ids[1] != ids[2]
+
+
+BEHIND = {**AROUND, **{name: f"f = {value}" for name, value in VALUES.items()}}
+
+
+@pytest.mark.parametrize("text", BEHIND.values(), ids=BEHIND)
+def test_what_a_module_of_the_user_holds_is_of_the_content(tmp_path, monkeypatch, text):
+    def made(k):
+        of_k = re.sub(r"\bK\b", str(k), text)
+        monkeypatch.setitem(sys.modules, "other", module(tmp_path, IMPORTS + of_k))
+        return function_id(module(tmp_path, "import other\ndef f(x): return other.f").f)
+
+    assert made(2.0) == made(2.0) != made(3.0)
+
+
+def test_what_no_function_names_is_no_content(tmp_path, monkeypatch):
+    def made(text):
+        monkeypatch.setitem(sys.modules, "other", module(tmp_path, f"k = 2.0\n{text}"))
+        return function_id(module(tmp_path, "import other\ndef f(x): return other.k * x").f)
+
+    assert made("unused = 1") == made("unused = 2")
+
+
+def test_docstrings_and_the_place_of_a_file_are_no_content(tmp_path):
+    def made(folder, doc):
+        folder.mkdir()
+        text = f"def f(x):\n    'In {doc}.'\n    return (lambda: 'a'), __file__, __name__"
+        return function_id(module(folder, text).f)
+
+    assert made(tmp_path / "a", "metres") == made(tmp_path / "b", "feet")
+
+
+def test_many_functions_and_an_empty_cell_are_read(tmp_path):
+    late = "def made():\n    def g(): return late\n    return g\n    late = 1\ng = made()"
+    chain = "\n".join(f"def f{i}(x): return f{i + 1}(x)" for i in range(3000))
+    text = f"{late}\n{chain}\ndef f3000(x): return "
+    ids = [function_id(module(tmp_path, f"{text}{k}, g").f0) for k in (1, 1, 2)]
     assert ids[0] == ids[1] != ids[2]
 
 
