@@ -11,6 +11,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from model import CONFIG, ROBOT
 
@@ -18,7 +19,7 @@ from hector_jax.control.contact import InputConstraint, Rows
 from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import nominal
-from hector_jax.core import environment
+from hector_jax.core import environment, identity
 from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError
 from hector_jax.core.part import Part
@@ -222,7 +223,21 @@ def test_a_module_that_a_module_of_the_user_imports_is_of_the_content(tmp_path, 
 def test_our_functions_and_installed_ones_have_their_names():
     assert function_id(variation_of) == "hector_jax.tuning.rollout.variation_of"
     assert function_id(jax.jit(variation_of)) == "hector_jax.tuning.rollout.variation_of"
-    assert function_id(np.linalg.norm) == "numpy.linalg.norm"
+    assert function_id(np.linalg.norm).startswith("numpy.linalg.norm#")
+
+
+INSTALLED = (np.linalg.norm, optax.linear_schedule, lambda x: optax.linear_schedule(x, 0.0, 1))
+
+
+@pytest.mark.parametrize("function", INSTALLED)
+def test_another_version_of_an_installed_package_makes_another_function(monkeypatch, function):
+    def at(version):
+        monkeypatch.setattr(identity, "version", lambda name: f"{version} of {name}")
+        monkeypatch.setattr(identity, "_versions", versions.__wrapped__)  # not cached
+        return function_id(function)
+
+    versions = identity._versions
+    assert at(1) == at(1) != at(2)
 
 
 def walk_alone(pool, config, robot, jobs, **options):

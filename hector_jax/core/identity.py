@@ -5,7 +5,8 @@ import hashlib
 import sys
 from collections import deque
 from collections.abc import Callable, Container, Iterator, Mapping
-from functools import partial
+from functools import cache, partial
+from importlib.metadata import packages_distributions, version
 from inspect import unwrap
 from types import CellType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
@@ -27,7 +28,7 @@ def function_id(function: Callable[..., Any]) -> str:
     values of the user that these name, in modules too, through the wrappers of JAX and other
     packages. Not seen are files that it reads, modules that it imports while it runs and names that
     it puts together. An object of the user that changes while it is used makes another function.
-    Our own code is in `code_hash`, other installed packages have a version.
+    Our own code is in `code_hash`; of an installed package the version counts.
     """
     inner = function.func if isinstance(function, partial) else function
     name = _name(inner if hasattr(inner, "__qualname__") else type(inner))
@@ -61,7 +62,8 @@ def _parts(value: Any, names: set[str]) -> Iterator[Any]:
 
     The names that functions look up are added to `names`.
     """
-    origin = _origin(value)
+    if (origin := _origin(value)) == "installed":
+        yield from _versions(_name(value).partition(".")[0])
     match value:
         case MethodType():
             yield value.__func__, value.__self__
@@ -138,6 +140,15 @@ def _name(value: Any) -> str:
         return ""
     # a worker process has the user's script under another name
     return f"{value.__module__}.{value.__qualname__}".replace("__mp_main__", "__main__")
+
+
+_distributions = cache(packages_distributions)  # which reads the files of all packages
+
+
+@cache
+def _versions(package: str) -> list[str]:
+    """Return name and version of what was installed as a package, such as numpy."""
+    return [f"{name} {version(name)}" for name in sorted({*_distributions().get(package, ())})]
 
 
 def _origin(value: Any) -> str:
