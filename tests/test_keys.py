@@ -17,6 +17,7 @@ from model import CONFIG, ROBOT
 
 from hector_jax.control.contact import InputConstraint, Rows
 from hector_jax.control.mpc import MpcConfig
+from hector_jax.control.parameters import TUNABLES, Tunable
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import nominal
 from hector_jax.core import environment, identity
@@ -218,6 +219,40 @@ def test_a_module_that_a_module_of_the_user_imports_is_of_the_content(tmp_path, 
         )
 
     assert made(2.0) == made(2.0) != made(3.0)
+
+
+MINE = Tunable("mpc.max_force", 0.0, 800.0)
+
+
+def with_mine(weights):
+    return weights._replace(others={"mine": 500.0})
+
+
+@pytest.mark.parametrize("changed", [{"path": "mpc.friction"}, {"lower": 0.1}, {"upper": 900.0}])
+def test_a_number_of_the_user_that_is_tuned_is_in_the_keys(monkeypatch, changed):
+    def keys(tunable):
+        monkeypatch.setitem(TUNABLES, "mine", tunable)
+        job = Job(with_mine(nominal()), named_command("s"), hfs())
+        return list(map(key, (tunings_of("mine"), with_mine(nominal()), job, tunings_of())))
+
+    def tunings_of(*others):
+        return replace(CONFIG, others=others)
+
+    before, again, after = keys(MINE), keys(MINE), keys(MINE._replace(**changed))
+    assert before == again
+    assert [x == y for x, y in zip(before, after, strict=True)] == [False, False, False, True]
+
+
+def test_a_record_of_a_number_of_the_user_goes_on_in_its_box_only(monkeypatch, tmp_path):
+    def begin(tunable):
+        monkeypatch.setitem(TUNABLES, "mine", tunable)
+        inputs = tmp_path, CONFIG, ROBOT, nominal(), {"s": named_command("s")}, [hfs()]
+        return walks.read_history(Campaign(*inputs, leg_numbers=("mine",)))
+
+    legs = Tunable("legs.height", 0.02, 0.2)
+    assert begin(legs) == begin(legs) == []
+    with pytest.raises(InputError, match="its settings is"):
+        begin(legs._replace(upper=0.1))
 
 
 def test_our_functions_and_installed_ones_have_their_names():

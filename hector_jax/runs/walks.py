@@ -136,8 +136,8 @@ def read_history(campaign: Campaign) -> list[Row]:
     head: dict[str, Any] = {
         "format": 2,
         "robot": robot_hash(campaign.robot),
-        "settings": content_key(campaign.config, code=()),
         "start": weights_tree(campaign.start),
+        "settings": content_key(campaign.config, campaign.start, code=()),
         "commands": {name: tree_hash(command) for name, command in campaign.commands.items()},
         "plants": [plant and tree_hash(plant) for plant in campaign.plants],
         "seed": campaign.seed,
