@@ -348,6 +348,18 @@ def test_another_log_after_an_undo_counts_in_place_of_the_first(folder, robot, c
     assert len(rows(folder)) == 1
 
 
+def test_the_logs_of_an_interrupted_report_are_reported_from_the_folder(folder, robot, capsys):
+    next_walk(folder, ("ahead",))
+    log = plain(robot, "ahead")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(walks, "add_row", lambda *_: sys.exit())  # killed
+        with pytest.raises(SystemExit):
+            report(folder, log)
+    report(folder, str(folder / "logs" / "0-0.npz"))
+    assert len(rows(folder)) == 1
+    assert (folder / "logs" / "0-0.npz").read_bytes() == Path("ahead.npz").read_bytes()
+
+
 def test_each_undo_takes_back_one_report_until_there_is_none(folder, robot, capsys):
     contents = []
     for number in range(3):
