@@ -381,21 +381,15 @@ def test_each_undo_takes_back_one_report_until_there_is_none(folder, robot, caps
 
 def test_the_line_has_logs_or_undo(folder):
     Path("a=b.npz").write_text("")
-    for line in ("robot --undo", "robot ahead=a=b.npz --undo", "robot ahead=a=b.npz"):
+    for line in ("robot --undo", "robot ahead=a=b.npz --no-undo", "robot ahead=a=b.npz"):
         parse.check(parse.from_line(["report", *line.split()]))
     for line, words in (
-        ("robot", "LOGS expects a value, got none"),
+        ("robot", "^LOGS expects a value, got none; or --undo$"),
+        ("robot ahead=nowhere.npz --undo", "^--undo takes no LOGS, got 'ahead=nowhere.npz'$"),
         ("robot ahead=nowhere.npz", "nowhere.npz: cannot read the file: No such file"),
     ):
         with pytest.raises(InputError, match=words):
             parse.check(parse.from_line(["report", *line.split()]))
-
-
-def test_undo_takes_no_logs(folder, robot):
-    next_walk(folder, ("ahead",))
-    log = plain(robot, "ahead")
-    report(folder, log)
-    refused(folder, "^--undo takes no LOGS, got 1 file$", log, undo=True)
 
 
 STEPS = [(walks, "add_row"), (reported_walks, "write_file"), (Path, "replace"), (Path, "unlink")]
