@@ -551,6 +551,21 @@ def test_a_log_in_the_folder_that_is_damaged_is_named_and_can_be_undone(walked, 
 # From end to end
 
 
+def test_a_folder_of_another_format_says_how_to_begin_anew(folder, robot, capsys):
+    next_walk(folder, ("ahead",))
+    report(folder, plain(robot, "ahead"))
+    record = folder / "walks.jsonl"
+    record.write_bytes(record.read_bytes().replace(b'"format": 2', b'"format": 1', 1))
+    words = "its format is 1, expected 2; begin anew in another folder: hector propose --start "
+    with pytest.raises(InputError, match=words + "robot/weights/N.json$"):
+        next_walk(folder)
+    begun = Path("anew")
+    begun.mkdir()
+    (begun / "metric.npz").write_bytes((folder / "metric.npz").read_bytes())
+    next_walk(begun, ("ahead",), start=str(folder / "weights" / "0.json"))
+    assert result(capsys)["walk"] == 0
+
+
 def test_the_point_of_weights_is_the_one_that_they_came_from(folder):
     next_walk(folder, ("ahead",))
     one = campaign(folder)

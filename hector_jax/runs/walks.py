@@ -133,6 +133,7 @@ def read_history(campaign: Campaign) -> list[Row]:
         InputError: the folder holds the record of another campaign, or a damaged one.
     """
     size, engine = len(box_of(campaign)), campaign.engine
+    options: dict[str, Any] = {}
     head: dict[str, Any] = {
         "format": 2,
         "robot": robot_hash(campaign.robot),
@@ -146,6 +147,8 @@ def read_history(campaign: Campaign) -> list[Row]:
     if campaign.reported:  # data: neither code nor loss can make them those of another campaign
         settings = {"seconds": campaign.seconds, "numbers": list(campaign.numbers)}
         head |= {"robot": walker_hash(campaign.robot), "settings": settings}
+        start = campaign.folder / "weights" / "N.json"
+        options = {"otherwise": f"begin anew in another folder: hector propose --start {start}"}
     else:
         head |= {"methods": list(campaign.methods), "grounded": campaign.grounded}
         head |= {"engine": engine.key, "code": code_hash("runs.walks", *engine.modules)}
@@ -157,7 +160,8 @@ def read_history(campaign: Campaign) -> list[Row]:
         losses = np.where(np.isfinite(losses), losses, np.inf)
         return Row(point, row["method"], row["predicted"], losses, float(row["margin"]))
 
-    return read_journal(campaign.folder / RECORD, head, what="tuning on walks", parse=parse)
+    options |= {"what": "tuning on walks", "parse": parse}
+    return read_journal(campaign.folder / RECORD, head, **options)
 
 
 def _walked(rows: Sequence[Row]) -> list[WalkResult]:
