@@ -172,7 +172,8 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
         values[name] = value
     if kind in (Tune, Propose) and isinstance(values.get("traj"), str):
         values["traj"] = [values["traj"]]  # older runs were tuned on one trajectory
-    return with_given(from_table(str(path), kind, values), values)
+    # a run records all its flags, also those that nobody gave
+    return with_given(from_table(str(path), kind, values), () if path.suffix == ".json" else values)
 
 
 def as_table(flags: Any) -> dict[str, Any]:
