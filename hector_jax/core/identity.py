@@ -78,8 +78,7 @@ def _parts(value: Any, names: set[str]) -> Iterator[Any]:
                 yield value.__defaults__, value.__kwdefaults__
                 yield _chosen(value.__globals__, own)
             if value.__closure__:  # an installed wrapper may hold a function of the user
-                empty = CellType()
-                yield [cell.cell_contents for cell in value.__closure__ if cell != empty]
+                yield [cell.cell_contents for cell in value.__closure__ if cell != CellType()]
             yield from filter(None, [getattr(value, "__wrapped__", None)])
         case _ if origin == "installed" and _origin(unwrap(value)) != "user":
             yield _name(value)

@@ -132,8 +132,7 @@ def read_history(campaign: Campaign) -> list[Row]:
     Raises:
         InputError: the folder holds the record of another campaign, or a damaged one.
     """
-    size, engine = len(box_of(campaign)), campaign.engine
-    options: dict[str, Any] = {}
+    size, engine, hint = len(box_of(campaign)), campaign.engine, ""
     head: dict[str, Any] = {
         "format": 2,
         "robot": robot_hash(campaign.robot),
@@ -147,8 +146,7 @@ def read_history(campaign: Campaign) -> list[Row]:
     if campaign.reported:  # data: neither code nor loss can make them those of another campaign
         settings = {"seconds": campaign.seconds, "numbers": list(campaign.numbers)}
         head |= {"robot": walker_hash(campaign.robot), "settings": settings}
-        start = campaign.folder / "weights" / "N.json"
-        options = {"otherwise": f"begin anew in another folder: hector propose --start {start}"}
+        hint = f" and begin anew with hector propose --start {campaign.folder}/weights/N.json"
     else:
         head |= {"methods": list(campaign.methods), "grounded": campaign.grounded}
         head |= {"engine": engine.key, "code": code_hash("runs.walks", *engine.modules)}
@@ -160,8 +158,8 @@ def read_history(campaign: Campaign) -> list[Row]:
         losses = np.where(np.isfinite(losses), losses, np.inf)
         return Row(point, row["method"], row["predicted"], losses, float(row["margin"]))
 
-    options |= {"what": "tuning on walks", "parse": parse}
-    return read_journal(campaign.folder / RECORD, head, **options)
+    path, what = campaign.folder / RECORD, "tuning on walks"
+    return read_journal(path, head, what=what, parse=parse, hint=hint)
 
 
 def _walked(rows: Sequence[Row]) -> list[WalkResult]:
