@@ -132,12 +132,12 @@ def read_history(campaign: Campaign) -> list[Row]:
     Raises:
         InputError: the folder holds the record of another campaign, or a damaged one.
     """
-    size, engine = len(box_of(campaign)), campaign.engine
+    size, engine, hint = len(box_of(campaign)), campaign.engine, ""
     head: dict[str, Any] = {
         "format": 2,
         "robot": robot_hash(campaign.robot),
-        "settings": content_key(campaign.config, code=()),
         "start": weights_tree(campaign.start),
+        "settings": content_key(campaign.config, campaign.start, code=()),
         "commands": {name: tree_hash(command) for name, command in campaign.commands.items()},
         "plants": [plant and tree_hash(plant) for plant in campaign.plants],
         "seed": campaign.seed,
@@ -146,6 +146,7 @@ def read_history(campaign: Campaign) -> list[Row]:
     if campaign.reported:  # data: neither code nor loss can make them those of another campaign
         settings = {"seconds": campaign.seconds, "numbers": list(campaign.numbers)}
         head |= {"robot": walker_hash(campaign.robot), "settings": settings}
+        hint = f" and begin anew with hector propose --start {campaign.folder}/weights/N.json"
     else:
         head |= {"methods": list(campaign.methods), "grounded": campaign.grounded}
         head |= {"engine": engine.key, "code": code_hash("runs.walks", *engine.modules)}
@@ -157,7 +158,8 @@ def read_history(campaign: Campaign) -> list[Row]:
         losses = np.where(np.isfinite(losses), losses, np.inf)
         return Row(point, row["method"], row["predicted"], losses, float(row["margin"]))
 
-    return read_journal(campaign.folder / RECORD, head, what="tuning on walks", parse=parse)
+    path, what = campaign.folder / RECORD, "tuning on walks"
+    return read_journal(path, head, what=what, parse=parse, hint=hint)
 
 
 def _walked(rows: Sequence[Row]) -> list[WalkResult]:
