@@ -82,8 +82,8 @@ def _tune_on_gpu(setup: Setup, start: Weights, problem: Problem) -> Tuning:
         losses = pool.submit(_losses_job, config, robot, start, problem).result()
         scales = losses / losses.mean()
     scenarios = [
-        batch.Scenario(model["command"], model["anchor"], np.asarray(0), config.loss, np.asarray(scale))
-        for model, scale in zip(models, scales, strict=True)
+        batch.Scenario(m["command"], m["anchor"], np.asarray(0), config.loss, np.asarray(scale))
+        for m, scale in zip(models, scales, strict=True)
     ]
     problems = stack([batch.Problem(start, stack(scenarios), np.asarray(1.0))])
     found = batch.tune_batch(config, robot, problems, stack([models[0]["effect"]]))

@@ -46,7 +46,13 @@ def _init(steps: Float[Array, " n"]) -> StepState:
     infinite, zeros = jnp.asarray(jnp.inf), jnp.zeros_like(steps)
     matrix = jnp.zeros((len(steps), len(steps)))
     return StepState(
-        jnp.asarray(1.0), steps, infinite, infinite, zeros, matrix, jnp.zeros((), jnp.int32)
+        jnp.asarray(1.0),
+        steps,
+        infinite,
+        infinite,
+        zeros,
+        matrix,
+        jnp.zeros((), jnp.int32),
     )
 
 
@@ -118,11 +124,11 @@ def trust_region(ridge: float) -> optax.GradientTransformationExtraArgs:
         begun, finite = jnp.isfinite(state.value), jnp.isfinite(value)
         ratio = gain_ratio(ridge, state, params, value)
         accepted = jnp.where(begun, ratio > LEAST, finite)
-        at_border = jnp.linalg.norm(params - state.steps) > 0.9 * state.size
+        length = jnp.linalg.norm(params - state.steps)
         larger = jnp.minimum(2.0 * state.size, LARGEST)
-        size = jnp.where((ratio > GOOD) & at_border, larger, state.size)
-        size = jnp.where(ratio < POOR, state.size / 2.0, size)
-        size = jnp.where(accepted, size, state.size / 3.0)
+        size = jnp.where((ratio > GOOD) & (length > 0.9 * state.size), larger, state.size)
+        size = jnp.where(ratio < POOR, length / 4.0, size)
+        size = jnp.where(accepted, size, length / 8.0)
         wrong = finite & ((ratio < POOR) | (ratio > OPTIMISTIC))
         misses = jnp.where(wrong, state.misses + 1, jnp.where(finite, 0, state.misses))
         kept = _keep(state, accepted, params, value, updates, matrix)
