@@ -94,7 +94,8 @@ def _trusted_step(ridge: float, state: StepState) -> Float[Array, " n"]:
         excess = jnp.sqrt(square) / state.size - 1.0
         return jnp.maximum(damping + excess * square / descent, 0.0)
 
-    damping = jax.lax.fori_loop(0, 40, improve, jnp.zeros_like(state.size))
+    least = jnp.maximum(jnp.linalg.norm(along) / state.size - values[-1], 0.0)
+    damping = jax.lax.fori_loop(0, 40, improve, least)
     return -vectors @ (along / (values + damping))
 
 
