@@ -105,9 +105,11 @@ class Fit:
         self.data = self.matrix @ np.exp(rng.uniform(-1, 1, 4)) + 0.02 * rng.normal(size=12)
 
     def residuals(self, z):
+        """Return the residuals at z."""
         return self.matrix @ np.exp(z) - self.data
 
     def jacobian(self, z):
+        """Return their derivative by z."""
         return self.matrix * np.exp(z)
 
     def minimum(self, ridge):
@@ -247,7 +249,7 @@ def test_the_largest_relative_step_of_a_block_is_its_beta():
 
 
 def test_the_literal_step_is_the_papers_formula():
-    """theta - beta dL / dtheta, of a weight that two feet share with its mean over the feet."""
+    """Theta less beta times its gradient, the mean over the feet that share a weight."""
     theta, feet, beta = np.array([30.0, 2e-4]), np.array([1, 2]), np.array([0.05, 0.08])
     of_feet = [np.array([0.4]), np.array([2e-6, -5e-6])]
     z = jnp.array([0.3, -0.2])
