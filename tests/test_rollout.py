@@ -338,5 +338,5 @@ def test_the_gradient_of_other_numbers_is_that_of_differences_and_of_the_recursi
         )
     config = replace(CONFIG, others=OTHERS, iterations=5)
     result = tune(config, robot, nominal(), STRAIGHT, anchor, PLAIN)
-    assert result.history[-1].evaluation.loss < found.loss
-    assert set(result.converged.others) == set(OTHERS)
+    assert result.loss < found.loss
+    assert set(result.weights.others) == set(OTHERS)

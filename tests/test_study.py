@@ -10,7 +10,7 @@ import pytest
 import table as study
 import table_plots
 import table_steps
-from pretend import pretend_history, pretend_walk
+from pretend import pretend_history, pretend_tuning, pretend_walk
 from table import Flags
 
 from hector_jax.cli import flags, run_folder, tune
@@ -25,7 +25,7 @@ from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Tuned
 from hector_jax.search.cmaes import Generation, SearchResult
 from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import TuneConfig, Tuning
+from hector_jax.tuning.difftune import TuneConfig
 
 
 def plants(seeds):
@@ -46,7 +46,7 @@ def asked(monkeypatch):
     def side_by_side(setup, start, problems, title, on_iteration):
         told["tunings"].append((setup.config.iterations, *problems))
         for name in problems:
-            yield name, Tuned(Tuning(pretend_history(12), nominal(), expert(), "done"), "")
+            yield name, Tuned(pretend_tuning(pretend_history(12), expert()), "")
 
     def walks_of(setup, jobs, title, engine):
         for job in jobs:
@@ -57,7 +57,7 @@ def asked(monkeypatch):
         raise VideoUnavailable("no film: none here")
 
     def tune_along_walks(bench, name, start, steps, plants):
-        return Tuned(Tuning(pretend_history(3), nominal(), expert(), "done"), "")
+        return Tuned(pretend_tuning(pretend_history(3), expert()), "")
 
     class Net:
         params = None
@@ -170,14 +170,14 @@ def test_a_tuning_along_walks_is_stored_for_its_plants_and_steps(tmp_path, monke
 
     def tune_measured(config, start, evaluate, on_iteration):
         made.append(config.iterations)
-        return Tuning(pretend_history(3), nominal(), expert(), "done")
+        return pretend_tuning(pretend_history(3), expert())
 
     monkeypatch.setattr(table_steps, "tune_measured", tune_measured)
     bench = table_steps.Bench(Setup(None, TuneConfig(), load_robot(), "abc"), None, tmp_path)
     for steps, count in ((2, 3), (2, 3), (5, 3), (2, 4)):
         tuned = table_steps.tune_along_walks(bench, "s", nominal(), steps, count)
         assert tuned.commit == "abc"
-        assert len(tuned.tuning.history) == 4
+        assert len(tuned.tuning.iterations) == 4
     assert made == [12, 15, 12]
     assert len(list((tmp_path / "s").glob("tuning-walks-*.npz"))) == 3
 
