@@ -43,11 +43,10 @@ class StepState(NamedTuple):
 
 
 def _init(steps: Float[Array, " n"]) -> StepState:
-    infinite, zeros = jnp.asarray(jnp.inf), jnp.zeros_like(steps)
-    matrix = jnp.zeros((len(steps), len(steps)))
-    return StepState(
-        jnp.asarray(1.0), steps, infinite, infinite, zeros, matrix, jnp.zeros((), jnp.int32)
-    )
+    # of the later type, or `update` is compiled again
+    one, infinite = (jnp.asarray(x, steps.dtype) for x in (1.0, jnp.inf))
+    zeros, matrix = jnp.zeros_like(steps), jnp.zeros((len(steps), len(steps)), steps.dtype)
+    return StepState(one, steps, infinite, infinite, zeros, matrix, jnp.zeros((), jnp.int32))
 
 
 def _model(ridge: float, state: StepState) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
