@@ -67,13 +67,17 @@ def told(fault=Fault.NONE, reach=0.0):
     return Command(*(np.concatenate([x, x[:1]]) for x in (seconds, velocity, [0.0, fault])))
 
 
-@jax.custom_vjp
+@jax.custom_jvp
 def spoiled(x, flag):
-    """`x`, with a gradient that is not a number where the flag is set."""
+    """`x`, with a derivative that is not a number where the flag is set."""
     return x
 
 
-spoiled.defvjp(lambda x, flag: (x, flag), lambda flag, g: (jnp.where(flag, jnp.nan, g), None))
+@spoiled.defjvp
+def _(primals, tangents):
+    (x, flag), (tangent, _) = primals, tangents
+    return x, jnp.where(flag, jnp.nan, 1.0) * tangent
+
 
 step_carry = rollout.step_carry
 
@@ -111,6 +115,7 @@ def params():
 
 
 RULES = {"gauss_newton": 3.0, "relative": 2.0}  # by how much a refusal shortens the step
+REACH = {"gauss_newton": 0.3, "relative": 0.03}  # a full step goes beyond it, some share does not
 
 
 def tune(command, params, config=CONFIG, robot=ROBOT):
@@ -146,7 +151,7 @@ def furthest(weights):
 @pytest.mark.parametrize("rule", RULES)
 def test_without_a_fault_nothing_is_refused_as_one(params, rule):
     found, lines = tune(told(), params, replace(CONFIG, rule=rule))
-    assert len(lines) == len(found.iterations) > 3
+    assert len(lines) == len(found.iterations) > 1
     if rule == "relative":
         assert all(line["accepted"] for line in lines)
         assert stop_reason(CONFIG, found.stop) == "14 iterations"
@@ -156,8 +161,8 @@ def test_without_a_fault_nothing_is_refused_as_one(params, rule):
 @pytest.mark.parametrize("fault", REASONS)
 @pytest.mark.parametrize("rule", RULES)
 def test_a_fault_is_refused_and_shrunk_and_the_run_goes_on(params, fault, rule):
-    """It shows beyond 0.03 in log-weights, which a full step reaches and some share does not."""
-    found, lines = tune(told(fault, 0.03), params, replace(CONFIG, rule=rule))
+    reach = REACH[rule]
+    found, lines = tune(told(fault, reach), params, replace(CONFIG, rule=rule))
     assert [line["step"] for line in lines[:2]] == [0.0, 1.0]
     assert [line["accepted"] for line in lines[:2]] == [True, False]
     first = next(i for i, line in enumerate(lines[1:], 1) if line["accepted"])
@@ -169,13 +174,13 @@ def test_a_fault_is_refused_and_shrunk_and_the_run_goes_on(params, fault, rule):
             assert line["step"] == min(1.0, 2.0 * before["step"])
     reasons = Counter(line["reason"] for line in lines if not line["accepted"])
     assert reasons.keys() <= {REASONS[fault], "the loss did not fall as predicted"}
-    assert reasons[REASONS[fault]] >= 2
+    assert reasons[REASONS[fault]] >= first - 1
     refused = sum(not line["accepted"] for line in lines)
     section = tuning_section("with", found, "")
     assert f"{len(lines) - 1} iterations, {refused} refused" in section
     assert all(inside(iteration.weights) for iteration in found.iterations)
-    assert all(furthest(i.weights) <= 0.03 for i in found.iterations if i.accepted)
-    assert 0.0 < furthest(found.weights) <= 0.03
+    assert all(furthest(i.weights) <= reach for i in found.iterations if i.accepted)
+    assert 0.0 < furthest(found.weights) <= reach
     assert np.isfinite(found.precision).all()
 
 

@@ -139,7 +139,7 @@ def test_starting_half_a_cycle_later_mirrors_the_walk(robot):
 @cache
 def start():
     """Nominal weights with other numbers, so that all gradients over 50 ticks share a program."""
-    return jax.tree.map(np.asarray, init(replace(CONFIG, others=OTHERS), nominal()).trial)
+    return jax.tree.map(np.asarray, init(replace(CONFIG, others=OTHERS), nominal()).start)
 
 
 def vector(weights):
@@ -336,7 +336,7 @@ def test_the_gradient_of_other_numbers_is_that_of_differences_and_of_the_recursi
         np.testing.assert_allclose(
             forward.others[name], found.gradient.others[name], rtol=1e-8, atol=1e-9
         )
-    config = replace(CONFIG, others=OTHERS, iterations=5)
+    config = replace(CONFIG, others=OTHERS, iterations=5, rule="relative")
     result = tune(config, robot, nominal(), STRAIGHT, anchor, PLAIN)
     assert result.loss < found.loss
     assert set(result.weights.others) == set(OTHERS)

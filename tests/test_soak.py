@@ -44,8 +44,9 @@ def work():
 def test_nothing_is_compiled_after_the_first_iteration(work, rule):
     """By either kind of rule, to the end, on another trajectory and with another net."""
     nets = [jax.tree.map(np.asarray, small_net(seed)) for seed in range(2)]
-    # steps that are too long, so that some are refused
-    config, seen = TuneConfig(rollout=SHORT, rule=rule, beta_q=0.9, beta_r=0.9), []
+    # the footsteps of a short walk are so rough that some steps are refused
+    config = TuneConfig(rollout=SHORT, rule=rule, others=("footstep_feedback", "turn_lead"))
+    seen = []
 
     def on_iteration(iteration):
         seen.append((int(iteration.iteration), bool(iteration.accepted), sum(work.values())))
@@ -56,10 +57,10 @@ def test_nothing_is_compiled_after_the_first_iteration(work, rule):
         tune(config, ROBOT, nominal(), command, ANCHOR, as_effect(net), on_iteration)
         work.clear()
     assert [number for number, *_ in seen].count(0) == 2
-    assert len(seen) > 8
+    assert len(seen) >= 4
     assert seen[0][2] > 0
     assert [count for *_, count in seen[1:]] == (len(seen) - 1) * [0]
-    if rule == "relative":
+    if rule == "gauss_newton":
         assert {accepted for _, accepted, _ in seen} == {True, False}
 
 
