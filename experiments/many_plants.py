@@ -31,7 +31,9 @@ from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import best, load_weights, save_weights, weights_tree
 from hector_jax.core.console import bar, exit_code
+from hector_jax.core.environment import code_hash
 from hector_jax.core.files import make_folder
+from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError, plural, require_package
 from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, Range, check
@@ -112,11 +114,13 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
 
     head = {
         "robot": robot_hash(campaign.robot),
-        "settings": content_key(campaign.config, code=("runs.walks", *engine.modules)),
+        "settings": content_key(campaign.config, campaign.start, code=()),
         "engine": engine.key,
+        "physics_bits": engine.bits(False),
         "numbers": list(campaign.numbers),
         "start": weights_tree(campaign.start),
         "plants": [tree_hash(plant) for plant in campaign.plants],
+        "code": [code_hash("runs.walks", *engine.modules), function_id(search)],
         **{name: getattr(flags, name) for name in ("population", "spread", "seed")},
     }
     size, dimensions = flags.population, len(box_of(campaign))

@@ -15,7 +15,6 @@ Walks are kept under OUT/walks and taken up again. `--standin` adds plants of th
 for a verdict; nothing here was chosen by them.
 """
 
-import inspect
 import itertools
 import math
 import sys
@@ -27,11 +26,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import adaptation
 import jax
 import numpy as np
 import plots
-import sensitivity
 import tyro
 from adaptation import Adaptation, OnlineConfig, retuner
 from lib import check_names, write_report
@@ -42,6 +39,7 @@ from hector_jax.control.weights import Weights, expert, nominal, weight_names, w
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import bar, exit_code
 from hector_jax.core.files import make_folder
+from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, SEED, validation_error
@@ -60,11 +58,8 @@ from hector_jax.sim.world import Imperfections, named_world
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 
-# modules that decide the numbers
+# modules of the package that decide the numbers
 CODE = ("tuning.difftune", "tuning.grounded", "grfm.network", "sim.walk")
-ADAPTATION = [
-    inspect.getsource(module) for module in (adaptation, sensitivity)
-]  # part of the cache keys, as CODE
 SETS = ("nominal", "expert", "tuned")
 WINDOW = 0.4  # [s] of the losses along a walk
 
@@ -237,7 +232,8 @@ def walk_cases(
     def path(case: Case) -> Path:
         config, _, job, effect, moment, arm = inputs[case]
         name = "-".join(case).replace(" ", "")
-        ending = content_key(config, robot, job, (effect,), moment, arm, ADAPTATION, code=CODE)
+        own = function_id(_walk_case)
+        ending = content_key(config, robot, job, (effect,), moment, arm, own, code=CODE)
         return flags.out / "walks" / f"{name}-{ending}.npz"
 
     def make(missing: Sequence[Case], _: Mapping[Case, Walked]) -> Iterator[tuple[Case, Walked]]:

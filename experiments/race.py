@@ -39,6 +39,7 @@ from hector_jax.control.weights_file import load_weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.console import bar, exit_code, say
 from hector_jax.core.files import make_folder
+from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.settings import AT_LEAST_ONE, SEED, Range, check
@@ -317,7 +318,7 @@ def read_model(pool: Executor, campaign: Campaign, *, searches: bool) -> Model:
     It is computed once, in a folder of its own for all that it depends on.
     """
     settings = campaign.config, campaign.robot, campaign.start, tuple(campaign.commands.values())
-    key = content_key(*settings, SEARCHES, SOURCES, code=("runs.walks",))
+    key = content_key(*settings, SEARCHES, function_id(search_job), code=("runs.walks",))
     campaign = replace(campaign, folder=campaign.folder / key)
     path, size = campaign.folder / "searches.npz", len(box_of(campaign))
     parts = {"steps": np.zeros((0, size)), "losses": np.zeros(0)}

@@ -3,7 +3,6 @@
 Each stores its results and reads existing results.
 """
 
-import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -11,14 +10,12 @@ from itertools import repeat
 from pathlib import Path
 from typing import NamedTuple
 
-import adaptation
-import measured
-import sensitivity
 from measured import evaluate_walk, tune_measured
 
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.console import bar, say
+from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.grfm.network import Params, effect_of
 from hector_jax.robot.model import Robot
@@ -35,11 +32,9 @@ from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
 
-# modules that decide the numbers, for `content_key`
+# modules of the package that decide the numbers, for `content_key`
 SEARCH_CODE = ("runs.searches", "sim.walk", "sim.parallel")
 WALKS_CODE = (*tunings.TUNING_CODE, "tuning.grounded", "sim.walk")
-# part of the cache keys, as WALKS_CODE
-MEASURED = [inspect.getsource(module) for module in (adaptation, measured, sensitivity)]
 
 
 class Bench(NamedTuple):
@@ -102,7 +97,8 @@ def tune_along_walks(bench: Bench, name: str, start: Weights, steps: int, plants
     problem = Problem((named_command(name),), bench.params)
     simulators = [hfs(), *(hfs_drawn(seed) for seed in range(500, 499 + plants))]
     inputs = config, robot, start, problem.commands[0], problem.params
-    key = content_key(*inputs, *simulators, MEASURED, code=WALKS_CODE)
+    own = function_id(_walk_job), function_id(tune_measured)
+    key = content_key(*inputs, *simulators, *own, code=WALKS_CODE)
     job = partial(_walk_job, config, robot, problem)
 
     def make(missing: list[str], _: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuned]]:

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import re
 import sys
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -10,14 +11,16 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from model import CONFIG, ROBOT
 
 from hector_jax.control.contact import InputConstraint, Rows
 from hector_jax.control.mpc import MpcConfig
+from hector_jax.control.parameters import TUNABLES, Tunable
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import nominal
-from hector_jax.core import environment
+from hector_jax.core import environment, identity
 from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError
 from hector_jax.core.part import Part
@@ -135,16 +138,70 @@ AROUND = {
     "path": "p = Path(str(K))\ndef f(x): return p",
     "other name": "a, b = np.sin, np.cos\nc = a if K < 2.5 else b\ndef f(x): return c(x)",
 }
+VALUES = {
+    "jit": "jax.jit(lambda x: K * x)",
+    "jax array": "jnp.array(K)",
+    "dictionary": "{'k': K}",
+    "list": "[K]",
+    "nested list": "[[K], 2.0] if K < 2.5 else [[2.0, 2.0]]",
+    "deque": "deque([K])",
+    "dataclass": "D(K)",
+    "partial": "functools.partial(pow, K)",
+}
 IMPORTS = """
+import functools
+from collections import deque
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
-import jax, optax, numpy as np
+import jax, optax, jax.numpy as jnp, numpy as np
+@dataclass
+class D:
+    k: float
 """
 
 
 @pytest.mark.parametrize("text", AROUND.values(), ids=AROUND)
 def test_a_function_of_the_user_is_seen_through_what_holds_it(tmp_path, text):
     ids = [function_id(module(tmp_path, f"{IMPORTS}K = {k}\n{text}\n").f) for k in (2.0, 2.0, 3.0)]
+    assert ids[0] == ids[1] != ids[2]
+
+
+BEHIND = {**AROUND, **{name: f"f = {value}" for name, value in VALUES.items()}}
+
+
+@pytest.mark.parametrize("text", BEHIND.values(), ids=BEHIND)
+def test_what_a_module_of_the_user_holds_is_of_the_content(tmp_path, monkeypatch, text):
+    def made(k):
+        of_k = re.sub(r"\bK\b", str(k), text)
+        monkeypatch.setitem(sys.modules, "other", module(tmp_path, IMPORTS + of_k))
+        return function_id(module(tmp_path, "import other\ndef f(x): return other.f").f)
+
+    assert made(2.0) == made(2.0) != made(3.0)
+
+
+def test_what_no_function_names_is_no_content(tmp_path, monkeypatch):
+    def made(text):
+        monkeypatch.setitem(sys.modules, "other", module(tmp_path, f"k = 2.0\n{text}"))
+        return function_id(module(tmp_path, "import other\ndef f(x): return other.k * x").f)
+
+    assert made("unused = 1") == made("unused = 2")
+
+
+def test_docstrings_and_the_place_of_a_file_are_no_content(tmp_path):
+    def made(folder, doc):
+        folder.mkdir()
+        text = f"def f(x):\n    'In {doc}.'\n    return (lambda: 'a'), __file__, __name__"
+        return function_id(module(folder, text).f)
+
+    assert made(tmp_path / "a", "metres") == made(tmp_path / "b", "feet")
+
+
+def test_many_functions_and_an_empty_cell_are_read(tmp_path):
+    late = "def made():\n    def g(): return late\n    return g\n    late = 1\ng = made()"
+    chain = "\n".join(f"def f{i}(x): return f{i + 1}(x)" for i in range(3000))
+    text = f"{late}\n{chain}\ndef f3000(x): return "
+    ids = [function_id(module(tmp_path, f"{text}{k}, g").f0) for k in (1, 1, 2)]
     assert ids[0] == ids[1] != ids[2]
 
 
@@ -164,10 +221,58 @@ def test_a_module_that_a_module_of_the_user_imports_is_of_the_content(tmp_path, 
     assert made(2.0) == made(2.0) != made(3.0)
 
 
+MINE = Tunable("mpc.max_force", 0.0, 800.0)
+
+
+def with_mine(weights):
+    return weights._replace(others={"mine": 500.0})
+
+
+@pytest.mark.parametrize("changed", [{"path": "mpc.friction"}, {"lower": 0.1}, {"upper": 900.0}])
+def test_a_number_of_the_user_that_is_tuned_is_in_the_keys(monkeypatch, changed):
+    def keys(tunable):
+        monkeypatch.setitem(TUNABLES, "mine", tunable)
+        job = Job(with_mine(nominal()), named_command("s"), hfs())
+        return list(map(key, (tunings_of("mine"), with_mine(nominal()), job, tunings_of())))
+
+    def tunings_of(*others):
+        return replace(CONFIG, others=others)
+
+    before, again, after = keys(MINE), keys(MINE), keys(MINE._replace(**changed))
+    assert before == again
+    assert [x == y for x, y in zip(before, after, strict=True)] == [False, False, False, True]
+
+
+def test_a_record_of_a_number_of_the_user_goes_on_in_its_box_only(monkeypatch, tmp_path):
+    def begin(tunable):
+        monkeypatch.setitem(TUNABLES, "mine", tunable)
+        inputs = tmp_path, CONFIG, ROBOT, nominal(), {"s": named_command("s")}, [hfs()]
+        return walks.read_history(Campaign(*inputs, leg_numbers=("mine",)))
+
+    legs = Tunable("legs.height", 0.02, 0.2)
+    assert begin(legs) == begin(legs) == []
+    with pytest.raises(InputError, match="its settings is"):
+        begin(legs._replace(upper=0.1))
+
+
 def test_our_functions_and_installed_ones_have_their_names():
     assert function_id(variation_of) == "hector_jax.tuning.rollout.variation_of"
     assert function_id(jax.jit(variation_of)) == "hector_jax.tuning.rollout.variation_of"
-    assert function_id(np.linalg.norm) == "numpy.linalg.norm"
+    assert function_id(np.linalg.norm).startswith("numpy.linalg.norm#")
+
+
+INSTALLED = (np.linalg.norm, optax.linear_schedule, lambda x: optax.linear_schedule(x, 0.0, 1))
+
+
+@pytest.mark.parametrize("function", INSTALLED)
+def test_another_version_of_an_installed_package_makes_another_function(monkeypatch, function):
+    def at(version):
+        monkeypatch.setattr(identity, "version", lambda name: f"{version} of {name}")
+        monkeypatch.setattr(identity, "_versions", versions.__wrapped__)  # not cached
+        return function_id(function)
+
+    versions = identity._versions
+    assert at(1) == at(1) != at(2)
 
 
 def walk_alone(pool, config, robot, jobs, **options):

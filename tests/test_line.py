@@ -1,5 +1,6 @@
 """The command line: its words become flags, or one line says which word is wrong."""
 
+import json
 import os
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from hector_jax.cli import commands
 from hector_jax.cli.arguments import flag_folder
 from hector_jax.cli.flags import COMMANDS, Compare, Evaluate, Export, Tune, View, Walk
 from hector_jax.cli.main import main
-from hector_jax.cli.parse import check, from_line, resolve_latest
+from hector_jax.cli.parse import as_table, check, from_line, resolve_latest
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.model import load_robot
 
@@ -245,6 +246,14 @@ def test_what_was_given_is_noted_through_files_and_latest(tmp_path, monkeypatch)
     assert args.given == {"config", "first_seed", "seeds"}
     assert args.is_given("first_seed")
     assert not args.is_given("world")
+
+
+def test_a_default_that_a_run_recorded_was_not_given(tmp_path):
+    config = tmp_path / "config.json"
+    config.write_text(json.dumps({"flags": as_table(Tune(iterations=20))}))
+    args = from_line(["tune", "--config", str(config)])
+    assert args.is_given("iterations")
+    assert not args.is_given("seeds")
 
 
 # Names that are not text

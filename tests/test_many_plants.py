@@ -42,7 +42,7 @@ def bowl(pool, campaign, engine, sets, batch=0):
         yield np.full(len(campaign.cases), 1.0 + distance + 10.0 * gain)
 
 
-ENGINE = SimpleNamespace(name="bowl", key="bowl", modules=())
+ENGINE = SimpleNamespace(name="bowl", key="bowl", modules=(), bits=lambda exact: 64)
 
 
 @pytest.fixture
@@ -72,6 +72,12 @@ def test_the_search_finds_the_bottom_and_continues_after_its_generations(campaig
         search(Executor(), campaign, ENGINE, flags)
     with pytest.raises(InputError, match="record of another search: its seed is 0, expected 5"):
         search(Executor(), campaign, ENGINE, Flags(seed=5, population=12))
+    single = SimpleNamespace(**vars(ENGINE) | {"bits": lambda exact: 32})
+    with pytest.raises(InputError, match="its physics_bits is 64, expected 32"):
+        search(Executor(), campaign, single, flags)
+    monkeypatch.setattr(many_plants, "losses_of", lambda *inputs, **named: bowl(*inputs, **named))
+    with pytest.raises(InputError, match="record of another search: by other code"):
+        search(Executor(), campaign, ENGINE, flags)
 
 
 def test_each_set_walks_all_plants_and_an_unsolved_walk_counts_as_the_worst(campaign, monkeypatch):

@@ -75,6 +75,19 @@ def test_differences_halve_a_step_that_raises_the_loss():
     np.testing.assert_allclose(lengths[1:] / lengths[:-1], 0.5)
 
 
+def test_what_the_model_tells_is_of_its_search(robot, tmp_path, monkeypatch):
+    config = TuneConfig(rollout=BRIEF)
+    campaign = Campaign(tmp_path, config, robot, nominal(), {"short": AHEAD}, [hfs()])
+    monkeypatch.setattr(walks, "space_of", lambda pool, campaign: campaign.folder)
+
+    def folder():
+        return race.read_model(None, campaign, searches=False).space
+
+    before, again = folder(), folder()
+    monkeypatch.setattr(race, "_model_loss", lambda *inputs: 1.0)
+    assert before == again != folder()
+
+
 @pytest.fixture(scope="module")
 def robot():
     return jax.tree.map(np.asarray, load_robot())

@@ -348,6 +348,18 @@ def test_another_log_after_an_undo_counts_in_place_of_the_first(folder, robot, c
     assert len(rows(folder)) == 1
 
 
+def test_the_logs_of_an_interrupted_report_are_reported_from_the_folder(folder, robot, capsys):
+    next_walk(folder, ("ahead",))
+    log = plain(robot, "ahead")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(walks, "add_row", lambda *_: sys.exit())  # killed
+        with pytest.raises(SystemExit):
+            report(folder, log)
+    report(folder, str(folder / "logs" / "0-0.npz"))
+    assert len(rows(folder)) == 1
+    assert (folder / "logs" / "0-0.npz").read_bytes() == Path("ahead.npz").read_bytes()
+
+
 def test_each_undo_takes_back_one_report_until_there_is_none(folder, robot, capsys):
     contents = []
     for number in range(3):
@@ -369,21 +381,15 @@ def test_each_undo_takes_back_one_report_until_there_is_none(folder, robot, caps
 
 def test_the_line_has_logs_or_undo(folder):
     Path("a=b.npz").write_text("")
-    for line in ("robot --undo", "robot ahead=a=b.npz --undo", "robot ahead=a=b.npz"):
+    for line in ("robot --undo", "robot ahead=a=b.npz --no-undo", "robot ahead=a=b.npz"):
         parse.check(parse.from_line(["report", *line.split()]))
     for line, words in (
-        ("robot", "LOGS expects a value, got none"),
+        ("robot", "^LOGS expects a value, got none; or --undo$"),
+        ("robot ahead=nowhere.npz --undo", "^--undo takes no LOGS, got 'ahead=nowhere.npz'$"),
         ("robot ahead=nowhere.npz", "nowhere.npz: cannot read the file: No such file"),
     ):
         with pytest.raises(InputError, match=words):
             parse.check(parse.from_line(["report", *line.split()]))
-
-
-def test_undo_takes_no_logs(folder, robot):
-    next_walk(folder, ("ahead",))
-    log = plain(robot, "ahead")
-    report(folder, log)
-    refused(folder, "^--undo takes no LOGS, got 1 file$", log, undo=True)
 
 
 STEPS = [(walks, "add_row"), (reported_walks, "write_file"), (Path, "replace"), (Path, "unlink")]
@@ -543,6 +549,21 @@ def test_a_log_in_the_folder_that_is_damaged_is_named_and_can_be_undone(walked, 
 
 
 # From end to end
+
+
+def test_a_folder_of_another_format_says_how_to_begin_anew(folder, robot, capsys):
+    next_walk(folder, ("ahead",))
+    report(folder, plain(robot, "ahead"))
+    record = folder / "walks.jsonl"
+    record.write_bytes(record.read_bytes().replace(b'"format": 2', b'"format": 1', 1))
+    words = "its format is 1, expected 2; .* begin anew with hector propose --start "
+    with pytest.raises(InputError, match=words + "robot/weights/N.json$"):
+        next_walk(folder)
+    begun = Path("anew")
+    begun.mkdir()
+    (begun / "metric.npz").write_bytes((folder / "metric.npz").read_bytes())
+    next_walk(begun, ("ahead",), start=str(folder / "weights" / "0.json"))
+    assert result(capsys)["walk"] == 0
 
 
 def test_the_point_of_weights_is_the_one_that_they_came_from(folder):

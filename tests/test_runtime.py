@@ -14,7 +14,7 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.trajectories import command_of
 from hector_jax.control.weights import nominal
 from hector_jax.core import runtime
-from hector_jax.core.numerics import without_ynnpack
+from hector_jax.core.numerics import without_our_flag, without_ynnpack
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import tunings
 from hector_jax.runs.setup import Setup
@@ -120,3 +120,14 @@ def test_ynnpack_is_turned_off_where_the_flag_is_known(monkeypatch, version, bef
     without_ynnpack()
     known = (0, 10, 2) <= version < (0, 13)
     assert os.environ["XLA_FLAGS"] == (after if known else before)
+
+
+@pytest.mark.parametrize(
+    ("flags", "of_user"),
+    [("FLAG= --xla_a=1 word", "--xla_a=1 word"), ("FLAG=dot word", "FLAG=dot word")],
+)
+def test_a_ynnpack_that_the_user_set_is_in_the_keys(flags, of_user):
+    flags, of_user = (
+        text.replace("FLAG", "--xla_cpu_experimental_ynn_fusion_type") for text in (flags, of_user)
+    )
+    assert without_our_flag(flags) == of_user

@@ -1,7 +1,7 @@
 """The flags of each command; a field's comment is its help text, its type contains its range."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, dataclass_transform
@@ -66,7 +66,7 @@ COMMANDS: dict[str, type[Any]] = {}
 """The flags of each command, by its name."""
 
 
-@dataclass_transform(frozen_default=True)
+@dataclass_transform(frozen_default=True, field_specifiers=(field,))
 def _command(kind: type[T]) -> type[T]:
     COMMANDS[kind.__name__.lower()] = kind
     return dataclass(frozen=True)(kind)
@@ -81,7 +81,7 @@ class Flags:
 
     def is_given(self, name: str) -> bool:
         """Tell whether a flag was given: on the line, in a file, or in Python by another value."""
-        default = next(field.default for field in fields(self) if field.name == name)
+        default = next(flag.default for flag in fields(self) if flag.name == name)
         return name in self.given or getattr(self, name) != default
 
 
@@ -211,7 +211,7 @@ class Report(Flags):
 
     folder: Folder  # of `hector propose`
     # one of each trajectory, in their order or as NAME=FILE (docs/howto/walks.md)
-    logs: tuple[Annotated[str, Source.LOG], ...]
+    logs: tuple[Annotated[str, Source.LOG], ...] = field(metadata={"or": "undo"})
     undo: bool = False  # take no logs, but take back the last report: its walk is waited for again
     processes: Processes = 2  # worker processes, one core each
     json: bool = False  # print JSON instead of text

@@ -172,7 +172,8 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
         values[name] = value
     if kind in (Tune, Propose) and isinstance(values.get("traj"), str):
         values["traj"] = [values["traj"]]  # older runs were tuned on one trajectory
-    return with_given(from_table(str(path), kind, values), values)
+    # a run records all its flags, also those that nobody gave
+    return with_given(from_table(str(path), kind, values), () if path.suffix == ".json" else values)
 
 
 def as_table(flags: Any) -> dict[str, Any]:
@@ -210,8 +211,13 @@ def check(flags: Any) -> None:
     for field in fields(flags):
         value, label = getattr(flags, field.name), _label(field)
         convert(value, field.type, name=label)
-        if value == () != field.default and not getattr(flags, "undo", False):
-            raise InputError(f"{label} expects a value, got none")
+        other = field.metadata.get("or", "")  # a flag that stands in place of this one
+        if getattr(flags, other, False):
+            if value:
+                raise InputError(f"--{other} takes no {label}, got {short_repr(value[0])}")
+        elif value == () != field.default:
+            hint = f"; or --{other}" if other else ""
+            raise InputError(f"{label} expects a value, got none{hint}")
         items = value if isinstance(value, tuple) else (value,)
         for i, item in enumerate(items):
             if item in items[:i]:

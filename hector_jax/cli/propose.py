@@ -83,8 +83,6 @@ def report(args: Report) -> None:
 
 
 def _undo(args: Report, campaign: Campaign) -> None:
-    if args.logs:
-        raise InputError(f"--undo takes no LOGS, got {plural(len(args.logs), 'file')}")
     with locked(args.folder):
         number, paths = reported_walks.undo_report(campaign)
     weights, logs = str(walks.weights_path(args.folder, number)), [str(path) for path in paths]

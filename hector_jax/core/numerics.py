@@ -78,7 +78,7 @@ def _defaults() -> dict[str, Any]:
 
 def without_our_flag(flags: str) -> str:
     """Return XLA_FLAGS as the user set them."""
-    return " ".join(word for word in flags.split() if _YNNPACK not in word)
+    return " ".join(word for word in flags.split() if word != f"{_YNNPACK}=")
 
 
 def without_ynnpack() -> None:

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+from hector_jax.control.parameters import TUNABLES
 from hector_jax.core.console import say
 from hector_jax.core.environment import code_hash
 from hector_jax.core.files import locked
@@ -36,6 +37,7 @@ def content_key(*parts: Any, code: Sequence[str]) -> str:
     """Return a hash (12 hexadecimal digits) of all inputs of a result.
 
     It is exact in every bit, but for the numbers of a robot, of which it has ROBOT_DIGITS digits.
+    Of the tunables that settings, weights or a job name it has what they are and their boxes.
 
     Args:
         parts: settings (hashed by their repr), robots and trees of numbers.
@@ -47,7 +49,9 @@ def content_key(*parts: Any, code: Sequence[str]) -> str:
             return robot_hash(part)
         return tree_hash(part) if isinstance(part, tuple | None) else repr(part)
 
-    key = "\n".join([*map(text, parts), code_hash(*code)])
+    others = [getattr(getattr(part, "weights", part), "others", ()) for part in parts]
+    boxes = sorted({TUNABLES[name] for names in others for name in names})
+    key = "\n".join([*map(text, parts), repr(boxes), code_hash(*code)])
     return hashlib.sha256(key.encode()).hexdigest()[:12]
 
 

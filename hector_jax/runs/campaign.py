@@ -145,3 +145,15 @@ def slope_of(
     of_model = np.append(directions(weights) @ by_log, others)
     # the model's loss does not depend on the numbers of the legs, which come last
     return space.to_steps.T @ np.pad(of_model, (0, len(space.box) - len(of_model)))
+
+
+def matrix_of(
+    campaign: Campaign, space: Space, matrix: Float[np.ndarray, "m m"]
+) -> Float[np.ndarray, "n n"]:
+    """Return a matrix by the point from that by the steps of a tuning, `parameters.stepped`."""
+    others = campaign.config.others
+    widths = [_unit(campaign, n) / (TUNABLES[n].upper - TUNABLES[n].lower) for n in others]
+    units = np.append(np.ones(len(matrix) - len(others)), widths)
+    # the model's loss does not depend on the numbers of the legs, which come last
+    steps = units[:, None] * space.to_steps[: len(matrix)]
+    return steps.T @ matrix @ steps

@@ -43,11 +43,11 @@ def add_report(
 ) -> list[walks.Row]:
     """Save a walk in the folder, first copies of its logs, then its row; return all rows."""
     rows = walks.read_history(campaign)
-    number = len(rows)
+    number, logs = len(rows), [file.read_bytes() for file in files]
     _set_aside(campaign, number)  # logs of a report that was undone or interrupted
     walks.proposal_path(campaign, number + 1).unlink(missing_ok=True)  # it followed that report
-    for path, file in zip(walks.log_paths(campaign, number), files, strict=True):
-        write_file(path, file.read_bytes())
+    for path, log in zip(walks.log_paths(campaign, number), logs, strict=True):
+        write_file(path, log)
     walks.add_walk(campaign, rows, proposal, walks.evaluate_logs(pool, campaign, number))
     return read_reports(pool, campaign)
 

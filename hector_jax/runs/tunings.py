@@ -30,7 +30,7 @@ from hector_jax.sim.diagnosis import not_the_weights
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
-from hector_jax.tuning import difftune, evaluate
+from hector_jax.tuning import batch, difftune, evaluate
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
 from hector_jax.tuning.evaluate import Objective, mean_objective
 from hector_jax.tuning.loss import loss_of_robot
@@ -74,15 +74,38 @@ def _tune_job(
     return difftune.descend(config, start, objective, lambda i: messages.put((name, i)))
 
 
+def _tune_on_gpu(setup: Setup, start: Weights, problem: Problem) -> Tuning:
+    """Run one tuning on the accelerator, as a batch of one."""
+    pool, config, robot, _ = setup
+    models, scales = _models(config, robot, problem), np.ones(1)
+    if len(models) > 1:
+        losses = pool.submit(_losses_job, config, robot, start, problem).result()
+        scales = losses / losses.mean()
+    scenarios = [
+        batch.Scenario(model["command"], model["anchor"], np.asarray(0), config.loss, np.asarray(scale))
+        for model, scale in zip(models, scales, strict=True)
+    ]
+    problems = stack([batch.Problem(start, stack(scenarios), np.asarray(1.0))])
+    found = batch.tune_batch(config, robot, problems, stack([models[0]["effect"]]))
+    return difftune.single(found, 0)
+
+
+def _losses_job(
+    config: TuneConfig, robot: Robot, start: Weights, problem: Problem
+) -> Float[np.ndarray, " commands"]:
+    """Return the loss of each command at the start."""
+    at, models = difftune.init(config, start).start, _models(config, robot, problem)
+    evaluations = [difftune.tune_step(config, robot, at, **model) for model in models]
+    return np.array([float(evaluation.loss) for evaluation in evaluations])
+
+
 def _objective(config: TuneConfig, robot: Robot, start: Weights, problem: Problem) -> Objective:
     """Return the mean over the commands of a problem, each with equal influence at the start."""
     models = _models(config, robot, problem)
     objectives = [difftune.model_objective(config, robot, **model) for model in models]
     if len(objectives) == 1:
         return objectives[0]
-    at = difftune.init(config, start).start
-    losses = np.array([float(objective.evaluate(at).loss) for objective in objectives])
-    return mean_objective(objectives, losses)
+    return mean_objective(objectives, _losses_job(config, robot, start, problem))
 
 
 def _models(config: TuneConfig, robot: Robot, problem: Problem) -> list[dict[str, Any]]:
@@ -99,7 +122,19 @@ def _tunings(
     title: str,
     on_iteration: Callable[[str, Iteration], None],
 ) -> Iterator[tuple[str, Tuned]]:
-    """Tune several problems in parallel and yield each tuning with its name when it ends."""
+    """Tune several problems in parallel and yield each tuning with its name when it ends.
+
+    Where there is a GPU they are tuned there, in turn.
+    """
+    if jax.default_backend() == "gpu":
+        with bar(title) as report_progress:
+            for done, (name, problem) in enumerate(problems.items()):
+                report_progress(done, len(problems), name)
+                tuning = _tune_on_gpu(setup, start, problem)
+                for iteration in tuning.iterations:
+                    on_iteration(name, iteration)
+                yield name, Tuned(tuning, setup.commit)
+        return
     done, total = 0, setup.config.iterations * len(problems)
     inputs = setup.config, setup.robot, start
     with message_queue() as messages, bar(title) as report_progress:
@@ -193,10 +228,8 @@ def gauss_newton_job(
     config: TuneConfig, robot: Robot, start: Weights, problem: Problem
 ) -> Float[np.ndarray, "n n"]:
     """Return the Gauss-Newton matrix divided by the loss, mean over the commands, in a worker."""
-    models = _models(config, robot, problem)
-    objectives = [difftune.model_objective(config, robot, **model) for model in models]
-    losses = np.array([float(objective.evaluate(start).loss) for objective in objectives])
-    return mean_objective(objectives, losses).matrix(start) / losses.mean()
+    losses = _losses_job(config, robot, start, problem)
+    return _objective(config, robot, start, problem).matrix(start) / losses.mean()
 
 
 def tune_config(robot: Robot, **settings: Any) -> TuneConfig:

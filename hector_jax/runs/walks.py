@@ -13,7 +13,7 @@ A weight set is walked in each case: all commands, on each plant. Its loss is th
 cases, each divided by its loss at the start, so that all count alike.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from itertools import repeat
 from pathlib import Path
@@ -36,7 +36,7 @@ from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
 from hector_jax.grfm import network
 from hector_jax.runs import tunings
 from hector_jax.runs.cache import content_key, robot_hash
-from hector_jax.runs.campaign import Campaign, box_of, slope_of, walker_hash, weights_at
+from hector_jax.runs.campaign import Campaign, box_of, matrix_of, slope_of, walker_hash, weights_at
 from hector_jax.runs.walk_log import Log, ScoredLog, evaluate_log, log_of, read_log, trajectory_of
 from hector_jax.search import few_walks
 from hector_jax.search.cmaes import add_row, read_journal
@@ -44,11 +44,10 @@ from hector_jax.search.few_walks import Model, Proposal, Space, WalkResult
 from hector_jax.sim.loop import Job
 from hector_jax.tuning.difftune import step_status
 from hector_jax.tuning.evaluate import Evaluation
-from hector_jax.tuning.grounded import Grounding, evaluate_grounded, fit_grounding
+from hector_jax.tuning.grounded import Grounding, evaluate_grounded, fit_grounding, grounded_matrix
 from hector_jax.tuning.status import StepStatus
 
 RECORD = "walks.jsonl"
-_REFUSED = 20.0  # log-loss of weights with which the model falls or has an unsolved QP
 
 
 class Row(NamedTuple):
@@ -97,6 +96,14 @@ def _evaluate_job(
     return jax.device_get(evaluate_grounded(*inputs, grounding, campaign.config.loss))
 
 
+def _matrix_job(
+    campaign: Campaign, weights: Weights, command: Command, grounding: Grounding
+) -> Float[np.ndarray, "m m"]:
+    inputs, config = _rollout_inputs(campaign, weights, command), campaign.config
+    found = grounded_matrix(*inputs, grounding, config.loss, others=config.others)
+    return np.asarray(found)
+
+
 def row_of(proposal: Proposal, cases: Sequence[ScoredLog]) -> Row:
     """Return the row of a proposal and the scores of its walks."""
     losses = np.array([score.loss for score, _ in cases])
@@ -132,12 +139,12 @@ def read_history(campaign: Campaign) -> list[Row]:
     Raises:
         InputError: the folder holds the record of another campaign, or a damaged one.
     """
-    size, engine = len(box_of(campaign)), campaign.engine
+    size, engine, hint = len(box_of(campaign)), campaign.engine, ""
     head: dict[str, Any] = {
         "format": 2,
         "robot": robot_hash(campaign.robot),
-        "settings": content_key(campaign.config, code=()),
         "start": weights_tree(campaign.start),
+        "settings": content_key(campaign.config, campaign.start, code=()),
         "commands": {name: tree_hash(command) for name, command in campaign.commands.items()},
         "plants": [plant and tree_hash(plant) for plant in campaign.plants],
         "seed": campaign.seed,
@@ -146,6 +153,7 @@ def read_history(campaign: Campaign) -> list[Row]:
     if campaign.reported:  # data: neither code nor loss can make them those of another campaign
         settings = {"seconds": campaign.seconds, "numbers": list(campaign.numbers)}
         head |= {"robot": walker_hash(campaign.robot), "settings": settings}
+        hint = f" and begin anew with hector propose --start {campaign.folder}/weights/N.json"
     else:
         head |= {"methods": list(campaign.methods), "grounded": campaign.grounded}
         head |= {"engine": engine.key, "code": code_hash("runs.walks", *engine.modules)}
@@ -157,7 +165,8 @@ def read_history(campaign: Campaign) -> list[Row]:
         losses = np.where(np.isfinite(losses), losses, np.inf)
         return Row(point, row["method"], row["predicted"], losses, float(row["margin"]))
 
-    return read_journal(campaign.folder / RECORD, head, what="tuning on walks", parse=parse)
+    path, what = campaign.folder / RECORD, "tuning on walks"
+    return read_journal(path, head, what=what, parse=parse, hint=hint)
 
 
 def _walked(rows: Sequence[Row]) -> list[WalkResult]:
@@ -256,25 +265,25 @@ def _model(pool: Executor, campaign: Campaign, space: Space, rows: Sequence[Row]
     inputs = repeat(campaign), repeat(weights), commands, _plan_logs(pool, campaign, best)
     groundings = list(pool.map(_ground_job, *inputs))
 
-    def evaluate(weights: Weights) -> list[Evaluation]:
-        inputs = repeat(campaign), repeat(weights), commands, groundings
-        return list(pool.map(_evaluate_job, *inputs))
+    def of_cases(job: Callable[..., Any], weights: Weights) -> list[Any]:
+        return list(pool.map(job, repeat(campaign), repeat(weights), commands, groundings))
 
-    model_losses = np.array([evaluation.loss for evaluation in evaluate(weights)])
+    model_losses = np.array([case.loss for case in of_cases(_evaluate_job, weights)])
     scales = rows[best].losses / rows[0].losses / model_losses / len(commands)
 
-    def model(point: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
+    def evaluate(point: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
         weights = weights_at(campaign, space, point)
-        cases = list(zip(scales, evaluate(weights), strict=True))
-        if any(step_status(campaign.config, case) != StepStatus.ACCEPTED for _, case in cases):
-            return _REFUSED, np.zeros_like(point)
-        loss = sum(scale * float(case.loss) for scale, case in cases)
-        grad = sum(
-            scale * slope_of(campaign, space, weights, case.gradient) for scale, case in cases
-        )
-        return float(np.log(loss)), np.asarray(grad / loss)
+        cases = of_cases(_evaluate_job, weights)
+        if any(step_status(campaign.config, case) != StepStatus.ACCEPTED for case in cases):
+            return np.inf, np.zeros_like(point)
+        slopes = [slope_of(campaign, space, weights, case.gradient) for case in cases]
+        return float(scales @ [float(case.loss) for case in cases]), scales @ np.array(slopes)
 
-    return model
+    def matrix(point: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
+        matrices = of_cases(_matrix_job, weights_at(campaign, space, point))
+        return matrix_of(campaign, space, np.tensordot(scales, matrices, axes=1))
+
+    return Model(evaluate, matrix)
 
 
 def add_walk(

@@ -237,7 +237,7 @@ def log_bounds(start: Weights) -> Float[np.ndarray, "directions 2"]:
 
 
 def read_journal(
-    path: Path, head: Mapping[str, Any], *, what: str, parse: Callable[[Any], T]
+    path: Path, head: Mapping[str, Any], *, what: str, parse: Callable[[Any], T], hint: str = ""
 ) -> list[T]:
     """Read the rows of a journal of JSON lines after its settings; create the file if missing.
 
@@ -248,6 +248,7 @@ def read_journal(
         head: settings that its first line must have.
         what: kind of the journal, for error messages.
         parse: converts a line's value to a row; ValueError, TypeError or KeyError if damaged.
+        hint: what to do if the settings are others, after "choose another folder".
 
     Raises:
         InputError: the file is no journal, has other settings, or is damaged.
@@ -269,7 +270,7 @@ def read_journal(
         got, expected = (str(settings.get(name))[:80] for settings in (written, head))
         reason = f"its {name} is {got}, expected {expected}"
         reason = OTHER_CODE if name == "code" else reason
-        raise InputError(f"{path}: record of another {what}: {reason}; choose another folder")
+        raise InputError(f"{path}: record of another {what}: {reason}; choose another folder{hint}")
     rows = []
     for number, line in enumerate(lines, 2):
         try:

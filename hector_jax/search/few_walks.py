@@ -19,16 +19,19 @@ Conn, Gould, Toint, "Trust region methods", 2000). A proposal is a function of t
 from collections.abc import Callable, Sequence
 from functools import partial
 from operator import itemgetter
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from jaxtyping import Float
 from scipy.optimize import LinearConstraint, NonlinearConstraint, minimize
 
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import require_package
+from hector_jax.tuning import step_rules
+from hector_jax.tuning.step_rules import StepState
 
 # added to the eigenvalues of the metric: a flat direction has a unit step of two e-folds
 _FLAT = 0.25
@@ -39,6 +42,7 @@ GAIN = 0.01
 """Smallest significant gain in log-loss."""
 _STALLED = 2  # walks of the model in a row without such a gain before the surrogate takes over
 _EVERY, _POPULATION, _SPREAD = 4, 8, 0.3  # CMA-ES: period [walks], population, first deviation
+_STEPS = 2  # on the model for a proposal
 _SAME = 0.02  # the model's point counts as walked within this distance of a walk
 _STARTS = 6  # of the maximisation of the expected improvement
 _ROWS = 16  # histories are padded to multiples of this, so that few programs are compiled
@@ -94,8 +98,12 @@ class Proposal(NamedTuple):
     predicted: float | None
 
 
-Model = Callable[[Float[np.ndarray, " n"]], tuple[float, Float[np.ndarray, " n"]]]
-"""Log-loss of the grounded model at a point, and its gradient."""
+class Model(NamedTuple):
+    """Functions of a point on the grounded model."""
+
+    # loss relative to the start, infinite if the model falls, and its gradient
+    evaluate: Callable[[Float[np.ndarray, " n"]], tuple[float, Float[np.ndarray, " n"]]]
+    matrix: Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, "n n"]]  # Gauss-Newton matrix
 
 
 class _Region(NamedTuple):
@@ -177,8 +185,7 @@ def propose(
         if model is None:
             raise ValueError("the next proposal needs the model")
         center = history[region.center].point
-        point, predicted = _minimise_in(space, center, region.radius, model, center, 15)
-        point = space.clip(point)
+        point, predicted = _descend_in(space, center, region.radius, model)
         if min(np.linalg.norm(point - row.point) for row in history) > _SAME:
             return Proposal(point, "model", float(predicted))
         region = region._replace(radius=_FIRST)
@@ -188,11 +195,31 @@ def propose(
     return _improve(space, history, region.radius, np.random.default_rng([seed, len(history)]))
 
 
+def _descend_in(
+    space: Space, center: Float[np.ndarray, " n"], radius: float, model: Model
+) -> tuple[Float[np.ndarray, " n"], float]:
+    """Take Gauss-Newton steps on the model in a ball and the box; returns point and log-loss."""
+    rule = step_rules.trust_region(ridge=0.0)
+    state = cast(StepState, rule.init(jnp.zeros(len(center))))._replace(size=jnp.asarray(radius))
+    point = center
+    for step in range(_STEPS + 1):
+        loss, gradient = model.evaluate(point)
+        good = step < _STEPS and np.isfinite(loss)
+        matrix = model.matrix(point) if good else np.zeros((len(point), len(point)))
+        given = {"value": jnp.asarray(loss), "matrix": jnp.asarray(matrix)}
+        away = jnp.asarray(point - center)
+        updates, state = rule.update(jnp.asarray(gradient), state, away, **given)
+        away = optax.projections.projection_l2_ball(optax.apply_updates(away, updates), radius)
+        point = space.clip(center + np.asarray(away))
+    state = cast(StepState, state)
+    return center + np.asarray(state.steps), float(jnp.log(state.value))
+
+
 def _minimise_in(
     space: Space,
     center: Float[np.ndarray, " n"],
     radius: float,
-    objective: Model,
+    objective: Callable[..., Any],
     first: Float[np.ndarray, " n"],
     iterations: int,
 ) -> tuple[Float[np.ndarray, " n"], float]:

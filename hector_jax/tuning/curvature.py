@@ -6,6 +6,7 @@ derivative. A direction of H with a small eigenvalue changes neither walk nor lo
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -81,11 +82,25 @@ def gauss_newton(
     Returns:
         The matrix in the n coordinates of `parameters.stepped`.
     """
+    inputs = {"command": command, "anchor": anchor, "effect": effect, "variation": variation}
+    return matrix(partial(walk, config, robot, **inputs), weights, loss, others)
+
+
+gauss_newton_jit = jax.jit(gauss_newton, static_argnums=0, static_argnames=("walk", "others"))
+"""`gauss_newton`, compiled once per rollout and set of terms."""
+
+
+def matrix(
+    walk: Callable[[Weights], Trajectory],
+    weights: Weights,
+    loss: Loss,
+    others: tuple[str, ...] = (),
+) -> Float[Array, "n n"]:
+    """Compute the Gauss-Newton matrix of the loss of the walk of a weight set."""
     zero = jnp.zeros(len(step_names(weights, others)))
 
     def moved(steps: Float[Array, " n"]) -> tuple[tuple[State, Wrench], Trajectory]:
-        at = stepped(weights, steps, others)
-        trajectory = walk(config, robot, at, command, anchor, effect, variation)
+        trajectory = walk(stepped(weights, steps, others))
         return (trajectory.state, trajectory.command), trajectory
 
     def tangent_of(direction: Float[Array, " n"]) -> tuple:
@@ -93,10 +108,6 @@ def gauss_newton(
 
     _, tangents, trajectory = jax.vmap(tangent_of, out_axes=(None, 0, None))(jnp.eye(len(zero)))
     return matrix_of_walk(loss, trajectory, tangents)
-
-
-gauss_newton_jit = jax.jit(gauss_newton, static_argnums=0, static_argnames=("walk", "others"))
-"""`gauss_newton`, compiled once per rollout and set of terms."""
 
 
 def matrix_of_walk(

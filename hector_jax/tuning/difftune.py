@@ -370,9 +370,23 @@ def descend(
         state, iteration = _update(static, state, evaluation, matrix)
         history.append(jax.tree.map(np.array, iteration))
         on_iteration(history[-1])
-    if state.stop == Stop.BAD_START:
-        raise InputError(f"the starting weights cannot be tuned from: {history[-1].reason}")
-    return jax.tree.map(np.asarray, result(config, state, stack(history)))
+    found = jax.tree.map(lambda x: np.asarray(x)[None], result(config, state, stack(history)))
+    return single(found, 0)
+
+
+def single(tunings: Tuning, row: int) -> Tuning:
+    """Return one tuning of a batch.
+
+    Raises:
+        InputError: its start was rejected.
+    """
+    found = jax.tree.map(lambda x: np.asarray(x)[row], tunings)
+    count = 1 + int(np.max(found.history.iteration))
+    found = found._replace(history=jax.tree.map(lambda x: x[:count], found.history))
+    if found.stop == Stop.BAD_START:
+        reason = found.iterations[0].reason
+        raise InputError(f"the starting weights cannot be tuned from: {reason}")
+    return found
 
 
 def needs_matrix(config: TuneConfig, state: TuneState, evaluation: Evaluation) -> Any:

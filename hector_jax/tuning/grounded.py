@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from hector_jax import qp
 from hector_jax.control.controller import measured_feet
@@ -22,6 +22,7 @@ from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
 from hector_jax.robot.model import Robot
+from hector_jax.tuning.curvature import matrix
 from hector_jax.tuning.evaluate import Evaluation, evaluation
 from hector_jax.tuning.loss import Loss
 from hector_jax.tuning.rollout import Carry, RolloutConfig, command_history, step_carry
@@ -159,3 +160,19 @@ def evaluate_grounded(
     """
     inputs = {"command": command, "effect": effect, "grounding": grounding}
     return evaluation(partial(grounded_rollout, config, robot, **inputs), weights, loss)
+
+
+@partial(jax.jit, static_argnums=0, static_argnames="others")
+def grounded_matrix(
+    config: RolloutConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    effect: jax.tree_util.Partial,
+    grounding: Grounding,
+    loss: Loss,
+    others: tuple[str, ...] = (),
+) -> Float[Array, "n n"]:
+    """Compute the Gauss-Newton matrix of a grounded rollout; see `curvature.gauss_newton`."""
+    inputs = {"command": command, "effect": effect, "grounding": grounding}
+    return matrix(partial(grounded_rollout, config, robot, **inputs), weights, loss, others)
