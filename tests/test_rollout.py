@@ -140,7 +140,7 @@ def test_starting_half_a_cycle_later_mirrors_the_walk(robot):
 @cache
 def start():
     """Nominal weights with other numbers, so that all gradients over 50 ticks share a program."""
-    return jax.tree.map(np.asarray, init(replace(CONFIG, others=OTHERS), nominal()).trial)
+    return jax.tree.map(np.asarray, init(replace(CONFIG, others=OTHERS), nominal()).start)
 
 
 def vector(weights):
