@@ -166,7 +166,7 @@ def test_falls_stand_at_the_edge_of_changes_and_do_not_squeeze_the_axis(tmp_path
     ratio = other.scores["with"].L / other.scores["nominal"].L
     assert any(np.array_equal(x, ratio[~other.scores["with"].fallen]) for x in dots)
     diamonds = next(line for line in c.lines if line.get_marker() == "D")
-    np.testing.assert_allclose(diamonds.get_xydata(), [[0.313, rows.index("without")]])
+    np.testing.assert_allclose(diamonds.get_xydata(), [[0.313, rows.index(label_of("without"))]])
     assert c.get_xlabel() == "change of L against nominal [%]"
 
 
