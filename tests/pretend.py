@@ -141,11 +141,16 @@ def pretend_history(iterations=10, pace=5.0, refused=(), **others):
     return history
 
 
-def pretend_tuning(history, weights=None, stop=Stop.LIMIT):
+def tuning_of(history, weights=None, stop=Stop.LIMIT):
     """A tuning of these iterations; in its matrix Q_pitch against Q_x matters most."""
-    direction = np.zeros(18)
-    direction[[1, 3]] = 0.9, -0.4
     last = [i for i in history if i.accepted][-1]
+    direction = np.zeros(18 + len(last.weights.others))
+    direction[[1, 3]] = 0.9, -0.4
     weights = last.weights if weights is None else weights
-    precision = np.outer(direction, direction) + 0.01 * np.eye(18)
+    precision = np.outer(direction, direction) + 0.01 * np.eye(len(direction))
     return Tuning(weights, last.evaluation.loss, precision, np.array(stop), stack(history))
+
+
+def pretend_tuning(iterations=30, weights=None, **history):
+    """The tuning of `pretend_history`, which leads to given weights, by default nominal."""
+    return tuning_of(pretend_history(iterations, **history), weights)

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 from model import BEST_OTHERS, CONFIG, ROBOT
-from pretend import pretend_tuning
+from pretend import tuning_of
 
 from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.mpc import MpcConfig
@@ -34,7 +34,7 @@ def _tuning(count):
         return Iteration(np.asarray(i), weights, seen, np.asarray(status), np.ones(()))
 
     history = [iteration(i) for i in range(2 * count - 1)]
-    return pretend_tuning(history)
+    return tuning_of(history)
 
 
 def test_the_best_point_of_each_path_over_all_commands_is_taken(monkeypatch, tmp_path, capsys):

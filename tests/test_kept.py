@@ -6,7 +6,7 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
-from pretend import pretend_history, pretend_tuning, pretend_walk
+from pretend import pretend_history, pretend_walk, tuning_of
 from test_experiments import script
 
 from hector_jax.control.parameters import bounds
@@ -24,7 +24,7 @@ from hector_jax.tuning.difftune import TuneConfig
 
 ROBOT, CONFIG, S = load_robot(), TuneConfig(), named_command("s")
 POOL = ThreadPoolExecutor(1)  # never asked
-TUNING = pretend_tuning(pretend_history(12, refused=(3, 5)), expert())
+TUNING = tuning_of(pretend_history(12, refused=(3, 5)), expert())
 
 
 def same(one, other):
@@ -98,7 +98,7 @@ def test_a_tuning_from_weights_with_other_numbers_comes_back(tmp_path, monkeypat
 
     def side_by_side(setup, start, problems, title, on_iteration):
         made.append(title)
-        yield "without", Tuned(pretend_tuning(history, start), "")
+        yield "without", Tuned(tuning_of(history, start), "")
 
     monkeypatch.setattr(tunings, "_tunings", side_by_side)
     for _ in range(2):  # as tuned, and as kept

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from pretend import SETS, pretend_history, pretend_tuning, pretend_verdict
+from pretend import SETS, pretend_history, pretend_verdict, tuning_of
 from rich.console import Console
 
 from hector_jax.control.parameters import bounds
@@ -31,7 +31,7 @@ WALKED = [Change("start", None, 0.0), Change("model", -12.34, -10), Change("mode
 def _report(verdict=None, film="no film: MuJoCo cannot draw here (egl: no device)"):
     history = pretend_history(14, refused=(3, 12))
     history[12] = history[12]._replace(status=np.array(StepStatus.UNSOLVED))
-    tuning = pretend_tuning(history, bounds()[1])
+    tuning = tuning_of(history, bounds()[1])
     errors = {
         name: {"force": x, "moment": x / 200, "stance": [x] * 6, "swing": [x] * 5 + [0.0]}
         for name, x in {"raw": 275.0, "linear": 119.0, "net": 73.0}.items()
@@ -228,7 +228,7 @@ def test_the_report_says_what_was_tuned_beside_the_weights():
     others = {"turn_lead": np.array(2.0), "kp": np.full(5, 60.0)}
     history = pretend_history(12, turn_lead=0.5, kp=others["kp"])
     end = expert()._replace(others=others)
-    text = tuning_section("with", pretend_tuning(history, end), "12 iterations")
+    text = tuning_section("with", tuning_of(history, end), "12 iterations")
     assert "- ended because: 12 iterations" in text
     assert "- L on the model: " in text
     assert "- turn_lead: 0.5 at the start, 2.0 at the end" in text

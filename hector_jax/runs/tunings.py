@@ -82,7 +82,9 @@ def _tune_on_gpu(setup: Setup, start: Weights, problem: Problem) -> Tuning:
         losses = pool.submit(_losses_job, config, robot, start, problem).result()
         scales = losses / losses.mean()
     scenarios = [
-        batch.Scenario(model["command"], model["anchor"], np.asarray(0), config.loss, np.asarray(scale))
+        batch.Scenario(
+            model["command"], model["anchor"], np.asarray(0), config.loss, np.asarray(scale)
+        )
         for model, scale in zip(models, scales, strict=True)
     ]
     problems = stack([batch.Problem(start, stack(scenarios), np.asarray(1.0))])
