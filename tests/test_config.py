@@ -123,7 +123,7 @@ def test_the_line_that_asks_again_needs_no_file(tmp_path):
         ("kept = []", "kept must be a path, got []"),
         ('trajectories = "c"', "trajectories must be a list, each text, got 'c'"),
         ("trajectories = [1]", "trajectories must be a list, each text, got [1]"),
-        ("iterations = 9", "iterations must be a whole number from 10 to 10000, got 9"),
+        ("iterations = 0", "iterations must be a whole number from 1 to 10000, got 0"),
         ("seeds = 1979-05-27", "seeds must be a whole number from 1 to 10000, got datetime.date"),
         ("seeds = ", "not valid TOML: "),
         ("seeds = 1\nseeds = 2", "not valid TOML: "),
