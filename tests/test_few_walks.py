@@ -7,6 +7,7 @@ from hector_jax.core import inputs
 from hector_jax.core.inputs import InputError
 from hector_jax.search.few_walks import (
     METHODS,
+    Model,
     WalkResult,
     incumbent,
     needs_model,
@@ -20,16 +21,26 @@ SPACE = space_of(MATRIX, np.tile([-3.0, 3.0], (SIZE, 1)))
 GOAL = np.array([0.8, -0.6, 0.5, 0.4, -0.7])  # in steps
 
 
+SCALE = np.append(np.diag(MATRIX), 1.0) + 0.3
+
+
 def bowl(goal, point):
     """A log-loss with its least value, 0, at a goal, and its gradient."""
     away = SPACE.to_steps @ point - goal
-    scale = np.append(np.diag(MATRIX), 1.0) + 0.3
-    return 0.5 * away @ (scale * away), SPACE.to_steps.T @ (scale * away)
+    return 0.5 * away @ (SCALE * away), SPACE.to_steps.T @ (SCALE * away)
 
 
-def model(point):
+def model_loss(point):
     """Wrong about where the goal is, and does not feel the last number."""
-    return bowl(GOAL * [0.8, 0.8, 0.5, 0.0, 0.0], point)
+    log, gradient = bowl(GOAL * [0.8, 0.8, 0.5, 0.0, 0.0], point)
+    return np.exp(log), np.exp(log) * gradient
+
+
+def model_matrix(point):
+    return model_loss(point)[0] * SPACE.to_steps.T @ np.diag(SCALE) @ SPACE.to_steps
+
+
+model = Model(model_loss, model_matrix)
 
 
 def walked(proposal, loss, margin=0.1):
