@@ -30,17 +30,21 @@ def bowl(goal, point):
     return 0.5 * away @ (SCALE * away), SPACE.to_steps.T @ (SCALE * away)
 
 
-def model_loss(point):
-    """Wrong about where the goal is, and does not feel the last number."""
-    log, gradient = bowl(GOAL * [0.8, 0.8, 0.5, 0.0, 0.0], point)
-    return np.exp(log), np.exp(log) * gradient
+def model_of(goal):
+    """A model whose loss is that bowl about a goal."""
+
+    def evaluate(point):
+        log, gradient = bowl(goal, point)
+        return np.exp(log), np.exp(log) * gradient
+
+    def matrix(point):
+        return evaluate(point)[0] * SPACE.to_steps.T @ np.diag(SCALE) @ SPACE.to_steps
+
+    return Model(evaluate, matrix)
 
 
-def model_matrix(point):
-    return model_loss(point)[0] * SPACE.to_steps.T @ np.diag(SCALE) @ SPACE.to_steps
-
-
-model = Model(model_loss, model_matrix)
+# wrong about where the goal is, and does not feel the last number
+model = model_of(GOAL * [0.8, 0.8, 0.5, 0.0, 0.0])
 
 
 def walked(proposal, loss, margin=0.1):
@@ -101,7 +105,7 @@ def test_a_model_that_repeats_itself_gives_way_to_the_surrogate_nearby():
     """Its predictions made the region large, which the surrogate has not earned."""
     history = []
     for _ in range(10):
-        proposal = propose(SPACE, history, lambda point: bowl(0.5 * GOAL, point))
+        proposal = propose(SPACE, history, model_of(0.5 * GOAL))
         if proposal.method == "surrogate":
             break
         history.append(walked(proposal, bowl(0.5 * GOAL, proposal.point)[0]))
