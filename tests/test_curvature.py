@@ -87,7 +87,8 @@ def test_the_gradient_by_steps_is_that_of_differences_and_of_the_forward_mode(ob
         reverse = float(direction @ found.gradient)
         assert np.abs(np.array(slopes) - reverse).min() <= 1e-6 * size
         assert abs(mean(Z, 1) - reverse) <= 1e-9 * size
-    assert float(found.value) == pytest.approx(mean(Z, 0), rel=1e-10)
+    value = shares @ np.array([float(rolled(name, Z)[0]) for name in COMMANDS])
+    assert float(found.value) == pytest.approx(value, rel=1e-10)
 
 
 def test_the_matrix_is_the_curvature_of_the_loss_along_the_change_of_the_walk(objectives):
