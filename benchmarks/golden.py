@@ -203,14 +203,14 @@ def tunings() -> Arrays:
     robot, found = load_robot(), {}
     known = robot, nominal(), named_command("s"), standing_anchor(robot)
     rules = {
-        "relative": TuneConfig(iterations=10),
-        "literal": TuneConfig(iterations=10, update="literal", beta_q=1e-5, beta_r=1e-17),
-        "untied": TuneConfig(iterations=10, tie_feet=False),
+        "gauss_newton": TuneConfig(),
+        "relative": TuneConfig(rule="relative"),
+        "literal": TuneConfig(rule="literal", beta_q=1e-5, beta_r=1e-17),
     }
     for name, config in rules.items():
         ended = tune(config, *known, effect_of(None, WalkConfig()))
-        found[f"{name}, L"] = [float(one.evaluation.loss) for one in ended.history]
-        found[f"{name}, weights"] = np.asarray(weights_to_vector(ended.ten))
+        found[f"{name}, L"] = [float(one.evaluation.loss) for one in ended.iterations]
+        found[f"{name}, weights"] = np.asarray(weights_to_vector(ended.weights))
     return found
 
 

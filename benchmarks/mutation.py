@@ -38,9 +38,10 @@ PARTS = {
         "qp gpu_kernel mpc",
     ),
     "tuning": (
-        "tuning/batch tuning/difftune tuning/loss tuning/grounded tuning/rollout"
-        " tuning/evaluate search/cmaes",
-        "loss variation config rollout difftune faults measured online search batch",
+        "tuning/batch tuning/difftune tuning/step_rules tuning/curvature tuning/loss"
+        " tuning/grounded tuning/rollout tuning/evaluate search/cmaes",
+        "loss variation config rollout difftune step_rules curvature faults measured online search"
+        " batch",
     ),
     "sim": (
         "sim/actuators sim/changes sim/loop sim/mjx_model sim/parallel sim/sensing sim/walk"

@@ -1,12 +1,13 @@
-"""DiffTune while walking: steps of the weights along the gradient over the last measured window.
+"""DiffTune while walking: steps of the weights by the derivative of the last measured window.
 
 Every `window` ticks the loss of these ticks is differentiated by the weights in use, and the
-weights take one step of DiffTune, with its checks. Dynamics and controller are differentiated at
-the measured states, feet and contacts (Eq. 9, 10), and the loss has the measured errors: both
-contain what the model does not know, such as a load on the trunk. A sagging trunk is the example:
-at the error e = d / k under a load d, the recursion along the measured states converges to
--(dk / dtheta) e / k, the derivative of d / k itself; in a rollout of the model from the measured
-state the error decays, and with it the gradient towards more stiffness.
+weights take one Gauss-Newton step of DiffTune, with its checks and within a fixed radius. Dynamics
+and controller are differentiated at the measured states, feet and contacts (Eq. 9, 10), and the
+loss has the measured errors: both contain what the model does not know, such as a load on the
+trunk. A sagging trunk is the example: at the error e = d / k under a load d, the recursion along
+the measured states converges to -(dk / dtheta) e / k, the derivative of d / k itself; in a rollout
+of the model from the measured state the error decays, and with it the gradient towards more
+stiffness.
 
 The sensitivities are carried on from window to window: the response of the closed loop to a weight
 is longer than a window, and a recursion restarted in each would cover its beginning only. On the
@@ -21,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import sensitivity
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from sensitivity import Sensitivities, no_tangents, step_sensitivities
 
 from hector_jax.control.controller import Retune, measured_feet
@@ -31,11 +32,12 @@ from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
-from hector_jax.core.settings import NOT_NEGATIVE, SHARE, Range, check
+from hector_jax.core.settings import NOT_NEGATIVE, POSITIVE, Range, check
 from hector_jax.core.trajectory import Trajectory, Wrench, has_fallen
 from hector_jax.core.tree import stack
 from hector_jax.robot.model import Robot
-from hector_jax.tuning.difftune import Iteration, TuneConfig, step_status, step_weights
+from hector_jax.tuning import difftune
+from hector_jax.tuning.difftune import Iteration, TuneConfig, TuneState, weights_at
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.grounded import MeasuredState, carry_from
 from hector_jax.tuning.loss import Loss, losses
@@ -51,11 +53,11 @@ class OnlineConfig:
     tune: TuneConfig = field(default_factory=TuneConfig)  # controller, loss, steps and checks
     window: int = 40  # ticks of the loss of a step, and between steps; a gait cycle
     late: int = 0  # ticks from a window's end to the use of its step
-    step: float = 1.0  # share of the full step of `tune`
+    radius: float = 0.2  # [e-folds] of the trust region of a step
     estimator: str = "carried"  # along measured states; "cut": restarted in each window; "model"
 
     def __post_init__(self) -> None:
-        check(self, window=Range(2), late=NOT_NEGATIVE, step=SHARE, estimator=ESTIMATORS)
+        check(self, window=Range(2), late=NOT_NEGATIVE, radius=POSITIVE, estimator=ESTIMATORS)
         if self.late >= self.window:
             raise InputError(f"OnlineConfig.late must be below window, got {self.late}")
 
@@ -82,7 +84,7 @@ def init_trace(anchor: Anchor, measured: MeasuredState, last: Wrench, weights: W
     return Trace(commands, NO_DISTURBANCE, no_tangents(carry, weights))
 
 
-def window_gradient(
+def window_derivatives(
     config: RolloutConfig,
     loss: Loss,
     robot: Robot,
@@ -94,8 +96,9 @@ def window_gradient(
     tick: Int[Array, ""],
     states: MeasuredState,
     measured: bool = True,
-) -> tuple[Trace, Evaluation]:
-    """Compute the loss of the ticks of a window and its gradient by the weights.
+    others: tuple[str, ...] = (),
+) -> tuple[Trace, Evaluation, Float[Array, "n n"]]:
+    """Compute the loss of the ticks of a window and its derivatives by the weights.
 
     Args:
         config: controller.
@@ -109,10 +112,11 @@ def window_gradient(
         states: n + 1 measurements, stacked: at the start of each tick and at the end of the last.
         measured: True along the measured states, False along a rollout of the model from the first
             measurement (static).
+        others: names of the numbers beside Q and R that are stepped (static).
 
     Returns:
-        The trace for the next window, and the evaluation, which includes the change from the
-        command before the window to its first.
+        The trace for the next window, the evaluation, which includes the change from the command
+        before the window to its first, and the Gauss-Newton matrix at the weights of the last tick.
 
     Source: Eq. 9-11, along measured states.
     """
@@ -131,27 +135,31 @@ def window_gradient(
         return (after, tangents), (sample, columns)
 
     begins, ends = jax.tree.map(lambda x: x[:-1], states), jax.tree.map(lambda x: x[1:], states)
-    state, first_weights = jax.tree.map(lambda x: x[0], (states, weights))
+    state, newest = jax.tree.map(lambda x: x[0], states), jax.tree.map(lambda x: x[-1], weights)
     carry = carry_from(state, anchor, trace.commands, trace.disturbance)
     ticks = tick + jnp.arange(len(begins.feet.yaw))
     (last, tangents), (samples, columns) = jax.lax.scan(
         step, (carry, trace.tangents), (ticks, weights, begins, ends)
     )
     walk, columns = _with_command_before(samples, columns, trace)
-    value, gradient = sensitivity.gradient(loss, walk, columns, first_weights)
+    value, gradient = sensitivity.gradient(loss, walk, columns, newest)
+    matrix = sensitivity.matrix(loss, walk, columns, newest, others)
     fallen, residual = jnp.mean(1.0 * samples.fallen), jnp.max(samples.residual)
     evaluation = Evaluation(value, losses(loss, walk), gradient, fallen, residual)
-    return Trace(last.commands, last.disturbance, tangents), evaluation
+    return Trace(last.commands, last.disturbance, tangents), evaluation, matrix
 
 
-_window_gradient = jax.jit(window_gradient, static_argnums=0, static_argnames="measured")
+_window_derivatives = jax.jit(
+    window_derivatives, static_argnums=0, static_argnames=("measured", "others")
+)
 
 
 def follow(
     config: TuneConfig, robot: Robot, *window: Any, measured: bool = True
-) -> tuple[Trace, Evaluation]:
-    """Run `window_gradient` with the rollout and the loss of a tuning, compiled."""
-    return _window_gradient(config.rollout, config.loss, robot, *window, measured=measured)
+) -> tuple[Trace, Evaluation, Float[Array, "n n"]]:
+    """Run `window_derivatives` with the settings of a tuning, compiled."""
+    how = {"measured": measured, "others": config.others}
+    return _window_derivatives(config.rollout, config.loss, robot, *window, **how)
 
 
 def _with_command_before(
@@ -179,22 +187,27 @@ _feet = jax.jit(measured_feet)
 class Adaptation(NamedTuple):
     """State of online tuning between two ticks."""
 
+    tuning: TuneState  # its weights are in use from tick `due` on; its rule has the radius only
+    sound: Float[Array, " n"]  # steps of the last accepted window
     weights: Weights  # in use
-    newest: Weights  # in use from tick `due` on
-    sound: Weights  # of the last accepted window
-    scale: float  # of the next step, 1 for a full one
-    newest_scale: float  # of the step that gave `newest`
-    windows: int  # number so far
     due: int  # gait tick
     trace: Trace | None  # of the windows so far; None before the first
     states: tuple[MeasuredState, ...]  # since the start of the window
     used: tuple[Weights, ...]  # over the ticks of the window
 
 
-def init_adaptation(weights: Weights) -> Adaptation:
+def init_adaptation(config: OnlineConfig, weights: Weights) -> Adaptation:
     """Return the state of online tuning before its first tick."""
-    start = jax.tree.map(np.asarray, weights)
-    return Adaptation(start, start, start, 1.0, 0.0, 0, 0, None, (), ())
+    tuning = _with_radius(difftune.init(config.tune, weights), config.radius)
+    start = jax.tree.map(np.asarray, tuning.start)
+    return Adaptation(tuning, tuning.steps, start, 0, None, (), ())
+
+
+def _with_radius(tuning: TuneState, radius: Any) -> TuneState:
+    return tuning._replace(rule=tuning.rule._replace(size=jnp.asarray(radius, float)))
+
+
+_update = jax.jit(difftune.update, static_argnums=0)
 
 
 def step_adaptation(
@@ -211,7 +224,7 @@ def step_adaptation(
     """Choose the weights for a tick of a walk; at the end of a window, also return its iteration.
 
     A window with a fall, an unsolved QP or a number that is not finite is rejected: the weights are
-    reset to those of the last accepted window, the step is halved and the sensitivities restart.
+    reset to those of the last accepted window, the radius is halved and the sensitivities restart.
 
     Args:
         config: the settings.
@@ -231,21 +244,23 @@ def step_adaptation(
     carry, iteration = carry._replace(states=states, trace=trace), None
     if len(carry.used) == config.window:
         window = states, carry.used, tick - config.window
-        trace, evaluation = _follow_window(config, robot, command, anchor, effect, trace, *window)
-        status = step_status(config.tune, evaluation)
-        row = carry.windows, carry.weights, evaluation, status, carry.newest_scale
-        iteration = Iteration(*jax.tree.map(np.asarray, row))
+        trace, *found = _follow_window(config, robot, command, anchor, effect, trace, *window)
+        # the state of the rule is that of a start, because another window is another objective, and
+        # the ratio of true to predicted gain compares losses of one; hence the fixed radius
+        after, iteration = _update(config.tune, carry.tuning, *found)
+        iteration, radius = jax.tree.map(np.asarray, iteration), carry.tuning.rule.size
         if iteration.accepted:
-            step = config.step * carry.scale
-            sound, scale = carry.newest, min(1.0, 2.0 * carry.scale)
-            newest = step_weights(config.tune, sound, evaluation.gradient, step)
+            sound, steps, radius = carry.tuning.steps, after.steps, min(config.radius, 2.0 * radius)
         else:
-            step, sound, newest, scale = 0.0, carry.sound, carry.sound, carry.scale / 2.0
+            sound, steps, radius = carry.sound, carry.sound, radius / 2.0
             trace = init_trace(anchor, state, last, carry.weights)
-        carry = carry._replace(newest=newest, sound=sound, scale=scale, newest_scale=step)
-        carry = carry._replace(windows=carry.windows + 1, due=tick + config.late)
-        carry = carry._replace(trace=trace, states=states[-1:], used=())
-    weights = carry.newest if tick >= carry.due else carry.weights
+        tuning = carry.tuning._replace(steps=steps, iteration=after.iteration)
+        carry = carry._replace(tuning=_with_radius(tuning, radius), sound=sound)
+        carry = carry._replace(due=tick + config.late, trace=trace, states=states[-1:], used=())
+    weights = carry.weights
+    if tick == carry.due:
+        weights = weights_at(config.tune, carry.tuning.start, carry.tuning.steps)
+        weights = jax.tree.map(np.asarray, weights)
     return carry._replace(weights=weights, used=(*carry.used, weights)), iteration
 
 
@@ -259,8 +274,8 @@ def _follow_window(
     states: Sequence[MeasuredState],
     used: Sequence[Weights],
     begin: int,
-) -> tuple[Trace, Evaluation]:
-    """Run `window_gradient` on the window from tick `begin`; returns NumPy arrays."""
+) -> tuple[Trace, Evaluation, Float[Array, "n n"]]:
+    """Run `window_derivatives` on the window from tick `begin`; returns NumPy arrays."""
     if config.estimator != "carried":
         trace = trace._replace(tangents=jax.tree.map(jnp.zeros_like, trace.tangents))
     window = trace, stack(used), np.asarray(begin, np.int32), stack(states)
@@ -291,5 +306,4 @@ def retuner(
             on_step(iteration)
         return carry, carry.weights
 
-    start = config.tune.rollout.walk.with_others(weights, config.tune.others)
-    return Retune(init_adaptation(start), step)
+    return Retune(init_adaptation(config, weights), step)

@@ -43,8 +43,8 @@ from hector_jax.runs.metrics import Score
 from hector_jax.runs.setup import Setup
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections, hfs, hfs_varied
-from hector_jax.tuning.batch import Problem, Scenario, Tunings, tail_weights, tune_batch
-from hector_jax.tuning.difftune import TuneConfig, stop_reason
+from hector_jax.tuning.batch import Problem, Scenario, tail_weights, tune_batch
+from hector_jax.tuning.difftune import TuneConfig, Tuning, stop_reason
 from hector_jax.tuning.loss import PAPER_LOSS, Terms, with_alphas
 from hector_jax.tuning.rollout import Variation, no_variation
 from hector_jax.tuning.status import Stop
@@ -62,7 +62,7 @@ class Flags:
     """Flags of all sub-commands that tune."""
 
     net: Path | None = None  # GRFM-Net to tune through; none: the plain rigid body
-    iterations: Annotated[int, AT_LEAST_ONE] = 100  # at most
+    iterations: Annotated[int, AT_LEAST_ONE] = 10  # at most
     processes: Annotated[int, AT_LEAST_ONE] = 2  # that walk in MuJoCo, one core each
 
     def __post_init__(self) -> None:
@@ -129,7 +129,7 @@ def tune(
     problems: Sequence[Problem],
     title: str,
     nominal_rows: slice = slice(None),
-) -> Tunings:
+) -> Tuning:
     """Tune problems as one batch; those of `nominal_rows` start at the nominal weights.
 
     Raises:
@@ -184,23 +184,28 @@ def row_of(tree: Any, row: int) -> Any:
     return jax.tree.map(lambda x: np.asarray(x)[row], tree)
 
 
-def accepted(tunings: Tunings) -> np.ndarray:
+def last_iterations(tunings: Tuning) -> np.ndarray:
+    """Return the number of the last iteration of each problem, after which its history is zero."""
+    return np.asarray(tunings.history.iteration).max(axis=1)
+
+
+def accepted(tunings: Tuning) -> np.ndarray:
     """Return the mask (problems, iterations) of the accepted iterations."""
     mask = tunings.history.accepted
-    return mask & (np.arange(mask.shape[1]) <= np.asarray(tunings.iterations)[:, None])
+    return mask & (np.arange(mask.shape[1]) <= last_iterations(tunings)[:, None])
 
 
-def final_terms(tunings: Tunings) -> Terms:
-    """Return the terms of the loss on the model of each converged set."""
+def final_terms(tunings: Tuning) -> Terms:
+    """Return the terms of the loss on the model of each tuned set."""
     mask = accepted(tunings)
     last = np.max(np.where(mask, np.arange(mask.shape[1]), 0), axis=1)
     return jax.tree.map(lambda x: x[np.arange(len(last)), last], tunings.history.evaluation.terms)
 
 
-def end_of(flags: Flags, tunings: Tunings, row: int) -> str:
+def end_of(flags: Flags, tunings: Tuning, row: int) -> str:
     """Describe why a tuning ended, and when."""
     reason = stop_reason(TuneConfig(iterations=flags.iterations), Stop(int(tunings.stop[row])))
-    return f"{reason} (after {tunings.iterations[row]})"
+    return f"{reason} (after {last_iterations(tunings)[row]})"
 
 
 def scores_on(
@@ -266,8 +271,8 @@ def shared(flags: Shared) -> None:
         return
 
     sets = {"nominal": nominal(), "expert": expert()}
-    sets |= {f"{n} alone": row_of(alone.converged, i) for i, n in enumerate(names)}
-    sets |= {n: row_of(together.converged, i) for i, n in enumerate(tails)}
+    sets |= {f"{n} alone": row_of(alone.weights, i) for i, n in enumerate(names)}
+    sets |= {n: row_of(together.weights, i) for i, n in enumerate(tails)}
     with workers(flags.processes) as pool:
         scores = {
             name: scores_on(pool, robot, sets, command, [hfs()], f"{name} on the hfs")
@@ -341,8 +346,8 @@ def robust(flags: Robust) -> None:
     if not first_host():
         return
 
-    sets = {"nominal": nominal(), "expert": expert(), "as it is": row_of(plain.converged, 0)}
-    sets |= {n: row_of(varied.converged, i) for i, n in enumerate(tails)}
+    sets = {"nominal": nominal(), "expert": expert(), "as it is": row_of(plain.weights, 0)}
+    sets |= {n: row_of(varied.weights, i) for i, n in enumerate(tails)}
     plants = [hfs_varied(seed) for seed in range(flags.plants)]
     with workers(flags.processes) as pool:
         scores = scores_on(pool, robot, sets, command, plants, "plants around the hfs")
@@ -391,7 +396,7 @@ def front(flags: Front) -> None:
     tunings = tune(flags, robot, whole_net(flags, robot), problems, "prices of tracking")
     if not first_host():
         return
-    sets = {f"tracking x{p:.3g}": row_of(tunings.converged, i) for i, p in enumerate(prices)}
+    sets = {f"tracking x{p:.3g}": row_of(tunings.weights, i) for i, p in enumerate(prices)}
     all_sets = {"nominal": nominal(), "expert": expert(), **sets}
     with workers(flags.processes) as pool:
         scores = scores_on(pool, robot, all_sets, command, [hfs()], "on the hfs")
@@ -447,8 +452,8 @@ def starts(flags: Starts) -> None:
         for end, x in (("start", first), ("end", last))
     ]
     best = np.flatnonzero(usable)[np.argsort(last)[:3]]
-    sets = {"from nominal": row_of(tunings.converged, 0)}
-    sets |= {f"best {i + 1}": row_of(tunings.converged, row) for i, row in enumerate(best)}
+    sets = {"from nominal": row_of(tunings.weights, 0)}
+    sets |= {f"best {i + 1}": row_of(tunings.weights, row) for i, row in enumerate(best)}
     with workers(flags.processes) as pool:
         scores = scores_on(pool, robot, sets, command, [hfs()], "on the hfs")
     make_folder(flags.out)

@@ -9,18 +9,20 @@ error; this method continues from there and costs a walk for every step.
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from adaptation import follow, init_trace
+from jaxtyping import Float
 
 from hector_jax.control.reference import Command, anchor_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.robot.model import Robot
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, Tuning, descend
-from hector_jax.tuning.evaluate import Evaluation, mean_of
+from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning, descend
+from hector_jax.tuning.evaluate import Evaluation, Objective, mean_of
 from hector_jax.tuning.grounded import measured_states
 
 _measured_states = jax.jit(measured_states)
@@ -34,8 +36,8 @@ def evaluate_walk(
     effect: jax.tree_util.Partial,
     walk: Trajectory,
     start_tick: int = 0,
-) -> Evaluation:
-    """Compute the loss of a measured walk, and its gradient through the model along the walk.
+) -> tuple[Evaluation, Float[Any, "n n"]]:
+    """Compute the loss of a measured walk, its gradient and matrix through the model along it.
 
     The first tick is left out: the reference is anchored in it.
 
@@ -63,25 +65,24 @@ def evaluate_walk(
     trace = init_trace(anchor, jax.tree.map(lambda x: x[0], states), first, weights)
     stacked = jax.tree.map(lambda w: np.broadcast_to(w, (ticks - 1, *np.shape(w))), weights)
     tick = np.asarray(start_tick + 1, np.int32)
-    _, evaluation = follow(config, robot, command, anchor, effect, trace, stacked, tick, states)
+    window = trace, stacked, tick, states
+    _, evaluation, matrix = follow(config, robot, command, anchor, effect, *window)
     fallen = jnp.maximum(evaluation.fallen, jnp.mean(1.0 * jnp.asarray(walk.fallen)))
     residual = jnp.maximum(evaluation.residual, jnp.max(jnp.asarray(walk.residual)))
-    return jax.tree.map(np.asarray, evaluation._replace(fallen=fallen, residual=residual))
+    evaluation = evaluation._replace(fallen=fallen, residual=residual)
+    return jax.tree.map(np.asarray, (evaluation, matrix))
 
 
 def tune_measured(
     config: TuneConfig,
     weights: Weights,
-    evaluate: Callable[[Weights], Sequence[Evaluation]],
+    evaluate: Callable[[Weights], Sequence[tuple[Evaluation, Float[Any, "n n"]]]],
     on_iteration: Callable[[Iteration], None] = lambda iteration: None,
 ) -> Tuning:
     """Tune on measured walks, from weights that have been tuned on the model.
 
-    A step is accepted only if the mean loss over the walks falls, as in every tuning after the
-    paper's ten iterations.
-
     Args:
-        config: the settings; the iterations count from the paper's ten on.
+        config: the settings.
         weights: the start.
         evaluate: walks with the weights on each plant and differentiates, see `evaluate_walk`.
         on_iteration: called after each iteration.
@@ -89,9 +90,11 @@ def tune_measured(
     Raises:
         InputError: a walk with the starting weights falls or is not solved.
     """
+    matrices = []  # of the walks evaluated last, which `descend` asks for: a walk is dear
 
     def mean(weights: Weights) -> Evaluation:
-        evaluations = evaluate(weights)
+        evaluations, matrices[:] = zip(*evaluate(weights), strict=True)
         return mean_of(evaluations, np.ones(len(evaluations)))
 
-    return descend(config, weights, mean, on_iteration, PAPER_ITERATIONS)
+    objective = Objective(mean, lambda weights: np.mean(matrices, axis=0))
+    return descend(config, weights, objective, on_iteration)

@@ -355,9 +355,10 @@ def report(flags: Flags, walks: Mapping[Case, Walked]) -> Path:
     residual = max((float(row.residual) for row in walks.values()), default=0.0)
     text = [
         f"A payload of {flags.payload:g} kg is put on the trunk {flags.change:g} s into walks of "
-        f"{flags.seconds:g} s, on {', '.join(names)}. The weights take a step of at most 5 % (Q) "
-        f"and 8 % (R) of themselves every {window:g} s, in force {10 * flags.late} ms after the "
-        f"window that it was computed from. Worst relative KKT residual of a plan: {residual:.0e}.",
+        f"{flags.seconds:g} s, on {', '.join(names)}. The weights take a Gauss-Newton step of at "
+        f"most {OnlineConfig.radius:g} e-folds every {window:g} s, in force {10 * flags.late} ms "
+        "after the window that it was computed from. Worst relative KKT residual of a plan: "
+        f"{residual:.0e}.",
         "\n".join(f"- `{arm}`: {ARMS[arm]}" for arm in flags.arms),
         "## What came out",
         "Changes of L in %, median over the walks and, in brackets, the least and the largest. "

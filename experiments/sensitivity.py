@@ -13,11 +13,13 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float, Int
 
+from hector_jax.control.parameters import step_names, stepped
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.robot.model import Robot
+from hector_jax.tuning.curvature import matrix_of_walk
 from hector_jax.tuning.loss import Loss, losses, total
 from hector_jax.tuning.rollout import (
     Carry,
@@ -124,3 +126,20 @@ def gradient(
         lambda g, s: jnp.tensordot(s, g, axes=g.ndim), slopes, tuple(sensitivities)
     )
     return value, ravel_pytree(weights)[1](jnp.asarray(sum(jax.tree.leaves(products))))
+
+
+def matrix(
+    loss: Loss,
+    trajectory: Trajectory,
+    sensitivities: Sensitivities,
+    weights: Weights,
+    others: tuple[str, ...] = (),
+) -> Float[jax.Array, "m m"]:
+    """Compute the Gauss-Newton matrix in the steps of `parameters.stepped` from `weights`."""
+
+    def moved(steps: Float[jax.Array, " m"]) -> Float[jax.Array, " n"]:
+        return ravel_pytree(stepped(weights, steps, others))[0]
+
+    by_steps = jax.jacobian(moved)(jnp.zeros(len(step_names(weights, others))))
+    tangents = sensitivities.state, sensitivities.command
+    return by_steps.T @ matrix_of_walk(loss, trajectory, tangents) @ by_steps

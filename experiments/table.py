@@ -42,19 +42,11 @@ from hector_jax.sim.world import Imperfections
 from hector_jax.tuning.difftune import TuneConfig
 
 PROGRAM = "python experiments/table.py"
-DIFFTUNE = ("without", "with")  # tuned on the model
-SETS = (
-    "nominal",
-    "expert",
-    "search_200",
-    *(f"{name}_ten" for name in DIFFTUNE),
-    *DIFFTUNE,
-    "with_walks",
-)
+SETS = ("nominal", "expert", "search_200", "paper", "without", "with", "with_walks")
 LONG_SEARCH = "search_2000"
 
 # limits of `quick`, for a trial of some minutes on two cores
-_QUICK = {"seeds": 4, "rollouts": 10, "iterations": 20, "steps": 2, "step_plants": 2}
+_QUICK = {"seeds": 4, "rollouts": 10, "iterations": 4, "steps": 2, "step_plants": 2}
 
 
 @dataclass(frozen=True)
@@ -70,8 +62,8 @@ class Flags(Configured):
     family: Family = "standin"  # of the plants; even: masses drawn evenly about the nominal ones
     # walks of the search, row `search_200`
     rollouts: Annotated[int, Range(SearchConfig.population, 1_000_000)] = 200
-    iterations: Iterations = 100  # largest number of iterations of each tuning
-    steps: Annotated[int, Range(0, 10_000)] = 30  # steps of row `with_walks`; 0: no such row
+    iterations: Iterations = 10  # largest number of steps of each tuning
+    steps: Annotated[int, Range(0, 10_000)] = 10  # of row `with_walks`; 0: no such row
     step_plants: Annotated[int, Range(1, 1000)] = 8  # simulator plants for each of these steps
     extra: tuple[str, ...] = ()  # more rows, NAME=FOLDER of straight.json, c.json and s.json
     # folder of row `search_2000`, if it exists
@@ -235,8 +227,7 @@ def _rows(
         "nominal": nominal(),
         "expert": expert(),
         "search_200": search.weights,
-        **{f"{name}_ten": tunings[name].tuning.ten for name in DIFFTUNE},
-        **{name: tuned.tuning.converged for name, tuned in tunings.items()},
+        **{name: tuned.tuning.weights for name, tuned in tunings.items()},
         **extra,
     }
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.image import imread
-from table_report import PAPER, paper_change
+from table_report import paper_change
 
 from hector_jax.core.console import say
 from hector_jax.core.trajectory import Trajectory, from_start
@@ -42,7 +42,7 @@ def draw(
     paper = {
         (trajectory, name, baseline): change
         for trajectory in verdicts
-        for name in PAPER[trajectory]
+        for name in verdicts[trajectory].scores
         for baseline in BASELINES
         if (change := paper_change(trajectory, name, baseline)) is not None
     }

@@ -23,35 +23,35 @@ from hector_jax.report.report import TEMPLATES, Picture, change_text, column, se
 from hector_jax.report.run import tuning_section
 from hector_jax.runs import metrics
 from hector_jax.runs.metrics import BASELINES, Comparison, Summary, Verdict
-from hector_jax.tuning.difftune import Tuning
+from hector_jax.tuning.difftune import TuneConfig, Tuning, stop_reason
 
 PAPER = {
     "straight": {
         "nominal": (9.66e2, 9.01e2, 7.15e5, 2.78e8),
         "expert": (2.49e2, 4.09e2, 8.11e5, 1.08e8),
-        "without_ten": (1.78e2, 3.87e2, 7.77e5, 0.96e8),
-        "with_ten": (1.86e2, 3.38e2, 8.90e5, 0.87e8),
+        "without": (1.78e2, 3.87e2, 7.77e5, 0.96e8),
+        "with": (1.86e2, 3.38e2, 8.90e5, 0.87e8),
     },
     "c": {
         "nominal": (2.32e3, 1.54e2, 3.56e5, 2.63e8),
         "expert": (2.97e3, 0.66e2, 4.49e5, 3.11e8),
-        "without_ten": (3.01e3, 2.38e2, 4.76e5, 3.50e8),
-        "with_ten": (1.75e3, 0.47e2, 4.56e5, 1.85e8),
+        "without": (3.01e3, 2.38e2, 4.76e5, 3.50e8),
+        "with": (1.75e3, 0.47e2, 4.56e5, 1.85e8),
     },
     "s": {
         "nominal": (1.91e3, 8.05e2, 0.89e6, 3.53e8),
         "expert": (1.65e3, 4.06e2, 1.00e6, 2.47e8),
-        "without_ten": (2.74e3, 23.27e2, 0.73e6, 7.41e8),
-        "with_ten": (1.47e3, 2.86e2, 1.02e6, 2.05e8),
+        "without": (2.74e3, 23.27e2, 0.73e6, 7.41e8),
+        "with": (1.47e3, 2.86e2, 1.02e6, 2.05e8),
     },
 }
-"""L_Eul, L_pos, L_ctrl and L by trajectory and set: the paper's table of losses in experiments."""
+"""L_Eul, L_pos, L_ctrl and L by trajectory and set, after ten iterations of the paper's rule: its
+table of losses in experiments."""
 
 PARTS = ("L_Eul", "L_pos", "L_ctrl", "L")  # in that order
 TITLES = {"straight": "Straight line", "c": "C curve", "s": "S curve"}
 OTHERS = {  # further sets to compare a set with, besides the baselines
-    "with": ("without", "search_200", "search_2000"),
-    "with_ten": ("without_ten",),
+    "with": ("paper", "without", "search_200", "search_2000"),
     "with_walks": ("with", "search_2000"),
 }
 
@@ -118,16 +118,24 @@ class Table(NamedTuple):
         return {term.name: term.unit for term in next(iter(self.verdicts.values())).loss}
 
 
+def paper_losses(trajectory: str, name: str) -> dict[str, float]:
+    """Return the paper's losses beside those of a set, by part; empty if it has none.
+
+    Those through its net stand beside the same rule (`paper`) and beside our own (`with`).
+    """
+    losses = PAPER.get(trajectory, {}).get("with" if name == "paper" else name, ())
+    return dict(zip(PARTS, losses, strict=False))
+
+
 def paper_change(trajectory: str, name: str, baseline: str, part: str = "L") -> float | None:
     """Return the change [%] of a part of the loss in the paper's table, from its rounded losses.
 
     None for a baseline against itself, and for a set that is not in that table.
     """
-    sets = PAPER.get(trajectory, {})
-    if name == baseline or name not in sets:
+    losses, before = paper_losses(trajectory, name), paper_losses(trajectory, baseline)
+    if name == baseline or not losses:
         return None
-    index = PARTS.index(part)
-    return 100.0 * (sets[name][index] / sets[baseline][index] - 1.0)
+    return 100.0 * (losses[part] / before[part] - 1.0)
 
 
 def summaries(verdicts: Mapping[str, Verdict]) -> dict[tuple[str, str], Summary]:
@@ -212,7 +220,7 @@ def write_table(folder: Path, table: Table) -> Path:
 def _report(table: Table, sets: Summaries) -> str:
     scores = [score for verdict in table.verdicts.values() for score in verdict.scores.values()]
     sections = [
-        tuning_section(f"{trajectory}, {name}", tuning)
+        tuning_section(f"{trajectory}, {name}", tuning, _stop(tuning), where=_where(name))
         for trajectory, tunings in table.tunings.items()
         for name, tuning in tunings.items()
     ]
@@ -241,6 +249,18 @@ def _report(table: Table, sets: Summaries) -> str:
     )
 
 
+def _where(name: str) -> str:
+    """Return where the loss of a tuning was computed, in words."""
+    walks = "of its walks on the simulator, mean over their plants"
+    return walks if name == "with_walks" else "on the model"
+
+
+def _stop(tuning: Tuning) -> str:
+    """Return why a tuning ended."""
+    done = max(1, len(tuning.iterations) - 1)
+    return stop_reason(TuneConfig(iterations=done), tuning.stop)
+
+
 def _csv(table: Table, sets: Summaries) -> str:
     """Return a row per trajectory, set and part of the loss; changes in %."""
     others = list(dict.fromkeys((*BASELINES, *itertools.chain(*OTHERS.values()))))
@@ -249,7 +269,7 @@ def _csv(table: Table, sets: Summaries) -> str:
         head += [f"{key}_{other}" for key in ("median", "low", "high", "wins", "counts")]
     rows: list[list[Any]] = [[*head, "paper", *(f"paper_{baseline}" for baseline in BASELINES)]]
     for (trajectory, name), summary in sets.items():
-        paper = PAPER.get(trajectory, {}).get(name)
+        paper = paper_losses(trajectory, name)
         for part in PARTS:
             row = [trajectory, name, part, table.units.get(part, ""), *summary.means[part]]
             row += [summary.falls, len(table.seeds)]
@@ -257,7 +277,7 @@ def _csv(table: Table, sets: Summaries) -> str:
                 pair = summary.against.get(other)
                 wins = pair.wins if pair and part == "L" else ""
                 row += [*pair.change[part], wins, pair.counts] if pair else [""] * 5
-            row.append(paper[PARTS.index(part)] if paper else "")
+            row.append(paper.get(part, ""))
             row += [paper_change(trajectory, name, baseline, part) for baseline in BASELINES]
             rows.append([_csv_number(cell) if isinstance(cell, float) else cell for cell in row])
     out = io.StringIO()
@@ -286,7 +306,7 @@ def _result(table: Table, sets: Summaries) -> dict[str, Any]:
         }
         result["ranking"] = ranking(verdict)
         result["tunings"] = {
-            name: {"iterations": len(tuning.history) - 1, "stop": tuning.stop}
+            name: {"iterations": len(tuning.iterations) - 1, "stop": _stop(tuning)}
             for name, tuning in table.tunings.get(trajectory, {}).items()
         }
         kinds = {"search_200": table.searches, "search_2000": table.long_searches}

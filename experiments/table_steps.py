@@ -10,6 +10,7 @@ from itertools import repeat
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from measured import evaluate_walk, tune_measured
 
 from hector_jax.control.reference import named_command
@@ -29,7 +30,7 @@ from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig
+from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
 
 # modules of the package that decide the numbers, for `content_key`
@@ -64,13 +65,20 @@ def search(
 
 
 def tune(bench: Bench, name: str, steps: int, plants: int) -> dict[str, Tuned]:
-    """Tune for one trajectory without and with the net; the latter on along walks, if any steps."""
+    """Tune for one trajectory without and with the net, and by the paper's rule in its ten steps.
+
+    The one with the net is tuned on along walks, if there are any steps.
+    """
     command = named_command(name)
     problems = {"without": Problem((command,), None), "with": Problem((command,), bench.params)}
     title = f"tuning {name} without and with GRFM-Net"
     results = tunings.tune(bench.setup, problems, bench.folder / name, title=title)
+    rule = bench.setup._replace(config=replace(bench.setup.config, rule="relative", iterations=10))
+    title = f"tuning {name} by the paper's rule"
+    problems = {"paper": problems["with"]}
+    results = tunings.tune(rule, problems, bench.folder / name, title=title) | results
     if steps:
-        start = results["with"].tuning.converged
+        start = results["with"].tuning.weights
         try:
             results["with_walks"] = tune_along_walks(bench, name, start, steps, plants)
         except InputError as error:  # a walk with the tuned weights falls
@@ -92,7 +100,7 @@ def tune_along_walks(bench: Bench, name: str, start: Weights, steps: int, plants
         InputError: a walk with the starting weights falls or is not solved; the folder cannot be
             written.
     """
-    setup = bench.setup._replace(config=TuneConfig(iterations=PAPER_ITERATIONS + steps))
+    setup = bench.setup._replace(config=TuneConfig(iterations=steps))
     pool, config, robot, commit = setup
     problem = Problem((named_command(name),), bench.params)
     simulators = [hfs(), *(hfs_drawn(seed) for seed in range(500, 499 + plants))]
@@ -105,7 +113,7 @@ def tune_along_walks(bench: Bench, name: str, start: Weights, steps: int, plants
         with bar(f"tuning {name} further, along walks on the simulator") as report_progress:
             report_progress(0, config.iterations, "compiling")
 
-            def evaluate(trial: Weights) -> list[Evaluation]:
+            def evaluate(trial: Weights) -> list[tuple[Evaluation, np.ndarray]]:
                 return list(pool.map(job, repeat(trial), simulators))
 
             def on_iteration(iteration: Iteration) -> None:
@@ -121,7 +129,7 @@ def tune_along_walks(bench: Bench, name: str, start: Weights, steps: int, plants
 
 def _walk_job(
     config: TuneConfig, robot: Robot, problem: Problem, weights: Weights, plant: Imperfections
-) -> Evaluation:
+) -> tuple[Evaluation, np.ndarray]:
     controller, (command,) = config.rollout.walk, problem.commands
     seconds = config.rollout.ticks * controller.gait.tick
     trajectory = walk(controller, robot, Job(weights, command, plant, seconds))

@@ -61,7 +61,7 @@ from hector_jax.runs.tunings import Problem
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig, rejection_reason, tune_step
+from hector_jax.tuning.difftune import TuneConfig, rejection_reason, tune_step
 from hector_jax.tuning.loss import PAPER_LOSS, loss_of
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
@@ -76,7 +76,7 @@ class Flags:
 
     data: Path = Path("data")  # walks and nets; made where missing
     out: Path = Path("runs/transfer")  # folder of the report
-    tuned: dict[str, Path] = field(default_factory=dict)  # TRAJ FILE; else tuned here, ten steps
+    tuned: dict[str, Path] = field(default_factory=dict)  # TRAJ FILE; else tuned here
     trajectories: tuple[str, ...] = COMMANDS
     sets: tuple[str, ...] = SETS
     phases: tuple[int, ...] = (0, 10, 20, 30)  # gait ticks at which the command starts
@@ -163,15 +163,15 @@ def tuned_sets(
     params: Params | None,
     loaded: Mapping[str, Weights],
 ) -> dict[str, Weights]:
-    """Return the weights after the paper's ten iterations by trajectory; tune if necessary."""
+    """Return tuned weights by trajectory; tune if necessary."""
     problems = {
         name: Problem((named_command(name),), params)
         for name in flags.trajectories
         if name not in loaded
     }
     setup = Setup(pool, config, robot, environment().get("commit", ""))
-    results = tunings.tune(setup, problems, flags.out, title="tuning, ten iterations")
-    return {**loaded, **{name: tuned.tuning.ten for name, tuned in results.items()}}
+    results = tunings.tune(setup, problems, flags.out, title="tuning")
+    return {**loaded, **{name: tuned.tuning.weights for name, tuned in results.items()}}
 
 
 def _walked(walk: Trajectory) -> Walked:
@@ -259,9 +259,7 @@ def measure(flags: Flags, loaded: Mapping[str, Weights], center: Weights) -> Res
         legs=LegConfig(gravity_compensation=flags.stance_weight),
     )
     configs = {
-        f", lead {lead}" if lead else "": TuneConfig(
-            rollout=RolloutConfig(walk=walk, lead=lead), iterations=PAPER_ITERATIONS
-        )
+        f", lead {lead}" if lead else "": TuneConfig(rollout=RolloutConfig(walk=walk, lead=lead))
         for lead in sorted({0, flags.lead})
     }
     commands = {name: named_command(name) for name in flags.trajectories}

@@ -35,7 +35,7 @@ DOORS = {
     "viser": ("report.view",),
     "trimesh": ("report.view",),
     "flax": ("grfm.nets",),
-    "optax": ("grfm.nets", "tuning.difftune"),
+    "optax": ("grfm.nets", "tuning.difftune", "tuning.step_rules", "search.few_walks"),
     "jaxopt": ("qp.jaxopt_solver",),
     "cmaes": ("search.",),
     "tinygp": ("search.few_walks",),

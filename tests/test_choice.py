@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 from model import BEST_OTHERS, CONFIG, ROBOT
+from pretend import tuning_of
 
 from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.mpc import MpcConfig
@@ -18,7 +19,7 @@ from hector_jax.robot.description import TuningSettings
 from hector_jax.runs import choice, verdicts
 from hector_jax.runs.metrics import score_like
 from hector_jax.runs.setup import Setup
-from hector_jax.tuning.difftune import Iteration, Tuning
+from hector_jax.tuning.difftune import Iteration
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.status import StepStatus
 
@@ -29,11 +30,11 @@ def _tuning(count):
 
     def iteration(i):
         weights = jax.tree.map(lambda w: w * (1.0 + i // 2), nominal())
-        status = StepStatus.ROSE if i % 2 else StepStatus.ACCEPTED
+        status = StepStatus.NO_GAIN if i % 2 else StepStatus.ACCEPTED
         return Iteration(np.asarray(i), weights, seen, np.asarray(status), np.ones(()))
 
     history = [iteration(i) for i in range(2 * count - 1)]
-    return Tuning(history, nominal(), history[-1].weights, "")
+    return tuning_of(history)
 
 
 def test_the_best_point_of_each_path_over_all_commands_is_taken(monkeypatch, tmp_path, capsys):

@@ -350,7 +350,7 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     small = CollectConfig(walks=6, seconds=1.0)
     monkeypatch.setattr(nets, "CollectConfig", lambda: small)
-    flags = ("--seeds", "2", "--iterations", "11")
+    flags = ("--seeds", "2", "--iterations", "6")
     assert call(monkeypatch, "tune", *flags, "--out", "run", "--json") == 0
     out = capsys.readouterr().out
     run = tmp_path / "run"
@@ -359,9 +359,9 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
         "traj": "straight",
         **json.loads((run / "result.json").read_text()),
     }
-    assert from_file(Tune, run / "config.json") == Tune(seeds=2, iterations=11, json=True)
+    assert from_file(Tune, run / "config.json") == Tune(seeds=2, iterations=6, json=True)
     assert float(json.loads((run / "versions.json").read_text())["seconds"]) > 0.0
-    names = ["nominal", "expert", "without_ten", "with_ten", "without", "with", "best"]
+    names = ["nominal", "expert", "without", "with", "best"]
     for name in names:
         assert name in out
         assert (run / "weights" / f"{name}.json").exists()
@@ -388,7 +388,7 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
         assert (run / "pictures" / f"{picture}.png").stat().st_size > 10_000
 
     # one set for two trajectories, from those weights, on the same data
-    start, flags = run / "weights" / "with.json", ("--seeds", "1", "--iterations", "10")
+    start, flags = run / "weights" / "with.json", ("--seeds", "1", "--iterations", "4")
     several = ("--traj", "straight", "c", "--start", start, "--no-video", "--out", "both")
     several += ("--tune", "turn_lead", "--net", Path("data/grfm.npz"), "--verdict")
     several += ("--share", "0.25")
@@ -398,7 +398,7 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     for title in ("straight, c, 1 plant", "straight, 1 plant", "c, 1 plant"):
         assert f"\n{title} on the" in f"\n{out}"
     result = json.loads(Path("both/result.json").read_text())
-    names = ["nominal", "expert", "start", "without_ten", "with_ten", "without", "with", "best"]
+    names = ["nominal", "expert", "start", "without", "with", "best"]
     assert list(result["sets"]) == names
     each = result["trajectories"]
     assert list(each) == ["straight", "c"]

@@ -1,60 +1,212 @@
-"""Which weights matter: the Gauss-Newton matrix against differences, and its words."""
+"""Gradient and Gauss-Newton matrix by the steps of a tuning against differences; its words."""
+
+from dataclasses import replace
+from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.interpreters.partial_eval import dce_jaxpr
+from model import ANCHOR, PLAIN, ROBOT
 
-from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.weights import direction_names, nominal, scale_weights
-from hector_jax.grfm.effect import last_command
-from hector_jax.robot.model import load_robot
-from hector_jax.tuning.curvature import gauss_newton, main_directions
+from hector_jax.control.parameters import step_names, stepped
+from hector_jax.control.reference import named_command
+from hector_jax.control.weights import direction_names, expert
+from hector_jax.tuning.curvature import determined, gauss_newton
+from hector_jax.tuning.difftune import (
+    TuneConfig,
+    init,
+    model_objective,
+    update,
+    weights_at,
+)
+from hector_jax.tuning.evaluate import mean_objective
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
-ROBOT = load_robot()
-CONFIG = RolloutConfig(ticks=30)
 NAMES = direction_names()
-WALK = named_command("c"), standing_anchor(ROBOT), last_command
+OTHERS = ("turn_lead", "footstep_feedback", "horizontal_gain", "yaw_gain")
+# past a switch of stance, with what is not believed of the world
+CONFIG = TuneConfig(
+    RolloutConfig(ticks=24, lead=10, estimate_noise=0.5, delay=0.004), others=OTHERS
+)
+COMMANDS = ("c", "s")
+START = expert()._replace(
+    others={"turn_lead": 0.6, "footstep_feedback": 0.1, "horizontal_gain": 3.0, "yaw_gain": 40.0}
+)
+Z = 0.2 * np.random.default_rng(1).normal(size=22) * np.r_[np.ones(18), 0.1 * np.ones(4)]
 
 
-def test_the_matrix_is_the_curvature_of_the_loss_along_the_change_of_the_walk():
-    loss, matrix = gauss_newton(CONFIG, ROBOT, nominal(), *WALK, PAPER_LOSS)
-    walk = jax.jit(rollout, static_argnums=0)
+@jax.jit
+def _rolled(command, z, direction):
+    def walk(z):
+        at = stepped(init(CONFIG, START).start, z, OTHERS)
+        found = rollout(CONFIG.rollout, ROBOT, at, command, ANCHOR, PLAIN)
+        return total(PAPER_LOSS, losses(PAPER_LOSS, found)), found
 
-    def walked(name, step):
-        logs = np.array([step * (one == name) for one in NAMES])
-        found = walk(CONFIG, ROBOT, scale_weights(nominal(), logs), *WALK)
-        return jax.tree.map(np.asarray, found)
+    return jax.jvp(walk, (z,), (direction,), has_aux=True)
 
-    start = walked("", 0.0)
 
-    def loss_at(state, command):
-        moved = start._replace(state=state, command=command)
-        return float(total(PAPER_LOSS, losses(PAPER_LOSS, moved)))
+def rolled(name, z, direction=np.zeros(22)):  # noqa: B008
+    """The loss after steps from the start, its derivative along a direction, and the walk."""
+    return jax.tree.map(np.asarray, _rolled(named_command(name), z, direction))
 
-    here = loss_at(start.state, start.command)
-    assert float(loss) == pytest.approx(here, rel=1e-12)
-    for name in ("Q_z", "R_Fz", "Q_wy"):
-        ends = [walked(name, step) for step in (1e-3, -1e-3)]
-        slope = jax.tree.map(lambda x, y: (x - y) / 2e-3, *((e.state, e.command) for e in ends))
-        around = [
-            loss_at(*jax.tree.map(lambda x, d, h=h: x + h * d, (start.state, start.command), slope))
-            for h in (1.0, -1.0)
+
+@pytest.fixture(scope="module")
+def objectives():
+    return [model_objective(CONFIG, ROBOT, named_command(name), ANCHOR, PLAIN) for name in COMMANDS]
+
+
+def point(objective):
+    """Gradient and matrix that a tuning has at Z."""
+    state = init(CONFIG, START)._replace(steps=jnp.asarray(Z))
+    at = weights_at(CONFIG, state.start, state.steps)
+    after, _ = update(CONFIG, state, objective.evaluate(at), objective.matrix(at))
+    assert float(after.rule.value) > 0.0
+    return after.rule
+
+
+def test_the_gradient_by_steps_is_that_of_differences_and_of_the_forward_mode(objectives):
+    """Of the mean of two commands, with tied feet and other numbers, noise and a delay."""
+    scales = np.array([2.0, 0.5])
+    found = point(mean_objective(objectives, scales / scales.mean()))
+    shares = scales.mean() / scales / 2.0
+    size = np.linalg.norm(found.gradient)
+    random = np.linalg.qr(np.random.default_rng(0).normal(size=(22, 22)))[0]
+    for direction in (*random[:6], *np.eye(22)[18:]):
+
+        def mean(z, part, along=direction):
+            parts = [float(rolled(name, z, along)[part]) for name in COMMANDS]
+            return shares @ np.array(parts)
+
+        slopes = [
+            (mean(Z + h * direction, 0) - mean(Z - h * direction, 0)) / (2 * h)
+            for h in (1e-5, 3e-6)
         ]
-        i = NAMES.index(name)
-        assert float(matrix[i, i]) == pytest.approx(sum(around) - 2 * here, rel=1e-4)
-    np.testing.assert_allclose(matrix, matrix.T, rtol=1e-9, atol=1e-9 * np.abs(matrix).max())
+        reverse = float(direction @ found.gradient)
+        assert np.abs(np.array(slopes) - reverse).min() <= 1e-6 * size
+        assert abs(mean(Z, 1) - reverse) <= 1e-9 * size
+    value = shares @ np.array([float(rolled(name, Z)[0]) for name in COMMANDS])
+    assert float(found.value) == pytest.approx(value, rel=1e-10)
+
+
+def test_the_matrix_is_the_curvature_of_the_loss_along_the_change_of_the_walk(objectives):
+    """J' (d2L / dw2) J, with J of the whole walk by central differences."""
+    matrix = np.asarray(point(objectives[0]).matrix)
+    walk = rolled("c", Z)[2]
+    leaves, structure = jax.tree.flatten((walk.state, walk.command))
+    ends = np.cumsum([0, *(x.size for x in leaves)])
+
+    def flat(trajectory):
+        return np.concatenate([np.ravel(x) for x in jax.tree.leaves(trajectory)])
+
+    def loss(vector):
+        parts = [
+            vector[a:b].reshape(x.shape) for a, b, x in zip(ends, ends[1:], leaves, strict=False)
+        ]
+        state, command = jax.tree.unflatten(structure, parts)
+        return total(PAPER_LOSS, losses(PAPER_LOSS, walk._replace(state=state, command=command)))
+
+    def column(direction, h=1e-5):
+        after, before = (rolled("c", Z + sign * h * direction)[2] for sign in (1.0, -1.0))
+        change = flat((after.state, after.command)) - flat((before.state, before.command))
+        return change / (2 * h)
+
+    J = np.stack([column(direction) for direction in np.eye(22)], axis=1)
+    W = np.asarray(jax.jit(jax.hessian(loss))(flat((walk.state, walk.command))))
+    expected = J.T @ W @ J
+    assert np.linalg.eigvalsh(expected)[0] >= -1e-9 * np.linalg.norm(expected)
+    # the entries of weights that matter little too
+    size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(matrix / size, expected / size, atol=1e-5)
+
+
+# How it is computed
+
+
+def equations(jaxpr):
+    """All equations of a program, also of those within."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for inner in jax.tree.leaves(
+            list(equation.params.values()), is_leaf=lambda x: hasattr(x, "eqns")
+        ):
+            inner = getattr(inner, "jaxpr", inner)
+            if hasattr(inner, "eqns"):
+                yield from equations(inner)
+
+
+def test_the_tangents_share_the_factors_of_the_qps_and_form_no_matrices():
+    config = replace(CONFIG.rollout, ticks=3, lead=2)
+    model = ROBOT, START, named_command("c"), ANCHOR, PLAIN, PAPER_LOSS
+    program = jax.make_jaxpr(partial(gauss_newton, config, others=OTHERS))(*model)
+    needed, _ = dce_jaxpr(program.jaxpr, [True])  # as the compiler leaves it
+    found = list(equations(needed))
+    for name in ("cholesky", "triangular_solve"):
+        factors = [e.invars[0].aval for e in found if e.primitive.name == name]
+        assert factors
+        assert {x.ndim for x in factors} == {2}  # a batch of directions would be a third axis
+    size = max(e.invars[0].aval.shape[-1] for e in found if e.primitive.name == "cholesky")
+    shapes = {getattr(x.aval, "shape", ()) for e in found for x in e.outvars}
+    assert (size, size) in shapes
+    assert (22, size) in shapes
+    assert not {s for s in shapes if len(s) > 2 and s[0] == 22 and s[-2:] == (size, size)}
+
+
+# What the walks determine
 
 
 def test_directions_are_said_with_the_weights_that_matter_in_them():
-    matrix = np.zeros((18, 18))
-    vector = np.zeros(18)
+    vector, ridge = np.zeros(18), 0.05
     vector[[NAMES.index("Q_pitch"), NAMES.index("Q_x"), NAMES.index("R_Fz")]] = 0.9, -0.43, 0.05
-    matrix += np.outer(vector, vector)
-    found = main_directions(matrix, nominal())
+    found = determined(np.outer(vector, vector) + ridge * np.eye(18), ridge, NAMES)
     (one,) = found.directions
+    curved = vector @ vector
     assert one.text == "`Q_pitch` against `Q_x`"
-    assert one.change == pytest.approx(0.5 * np.log(2.0) ** 2 * vector @ vector)
+    assert one.change == pytest.approx(0.5 * np.log(2.0) ** 2 * curved)
+    assert one.fixed == pytest.approx(curved / (curved + ridge))
     assert found.number == 18
-    assert set(found.flat) == {*NAMES} - {"Q_pitch", "Q_x"}
+    flat = {*NAMES} - {"Q_pitch", "Q_x", "R_Fz"}
+    assert flat < set(found.left_open)
+    assert {found.weights[name] for name in flat} == {0.0}
+    # of the variance 1 / ridge of the ridge alone, the walk takes what lies along its direction
+    share = vector[NAMES.index("Q_pitch")] ** 2 / curved * one.fixed
+    assert found.weights["Q_pitch"] == pytest.approx(share)
+    assert "Q_pitch" not in found.left_open
+
+
+@pytest.mark.parametrize(
+    ("rank", "ridge"), [(0, 0.01), *((r, k) for r in (5, 18) for k in (0.0, 1e-4, 0.01, 10.0))]
+)
+def test_shares_lie_from_0_to_1_and_grow_with_the_data(rank, ridge):
+    rng = np.random.default_rng(rank)
+    J = rng.normal(size=(rank, 18)) * 10.0 ** rng.uniform(-1.5, 0.5, 18)
+    found = determined(J.T @ J + ridge * np.eye(18), ridge, NAMES)
+    shares = np.array([*found.weights.values(), *(d.fixed for d in found.directions)])
+    assert ((shares >= 0.0) & (shares <= 1.0)).all()
+    assert len(found.directions) <= rank
+    assert [d.change for d in found.directions] == sorted(
+        (d.change for d in found.directions), reverse=True
+    )
+    if ridge > 0.0:
+        more = determined(4.0 * J.T @ J + ridge * np.eye(18), ridge, NAMES)
+        for name, share in found.weights.items():
+            assert more.weights[name] >= share - 1e-9
+    if rank == 0:
+        assert set(found.left_open) == {*NAMES}
+
+
+def test_without_a_ridge_the_walk_fixes_all_that_it_sees():
+    scale = np.geomspace(1e-2, 1e2, 18)
+    found = determined(np.diag(scale), 0.0, NAMES)
+    assert found.left_open == []
+    assert {d.fixed for d in found.directions} == {1.0}
+
+
+def test_the_words_of_other_numbers_are_their_names():
+    names = step_names(START, OTHERS)
+    matrix = np.zeros((22, 22))
+    matrix[18, 18] = 5.0
+    (one,) = determined(matrix + 0.01 * np.eye(22), 0.01, names).directions
+    assert one.text == "`turn_lead`"

@@ -9,7 +9,7 @@ import pytest
 from synthetic import CYCLE, synthetic_walk, turn_walk
 
 from hector_jax.control.reference import Anchor, named_command, reference_at
-from hector_jax.control.weights import expert, nominal, weights_to_vector
+from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.tree import stack
 from hector_jax.grfm.collection import collect, fingerprint, load_walks
 from hector_jax.grfm.dataset import at_interval, make_dataset, split_by_walk, with_mirror
@@ -75,14 +75,33 @@ def test_a_third_of_the_walks_is_pushed_once_or_twice():
         assert not push.force[:, 2].any()
 
 
-def test_points_of_tuning_paths_are_walked_where_paths_are_given():
-    path = jax.tree.map(lambda w: np.stack([w * (1 + i) for i in range(5)]), nominal())
-    vectors = np.asarray(weights_to_vector(path))
-    on_path = [
-        np.isclose(vectors, weights_to_vector(job.weights)).all(axis=1).any()
-        for job in draw_jobs(0, 24, [path])
-    ]
-    assert sum(on_path) == 8
+def test_weights_on_the_log_lines_of_tuning_paths_are_walked_where_paths_are_given():
+    """A third of the walks; between the accepted points of one path, and all along it."""
+    rng = np.random.default_rng(0)
+    logs = [np.cumsum(rng.normal(size=(n, 24)) * 0.3, axis=0) for n in (5, 2, 1)]
+    start = np.asarray(weights_to_vector(nominal()))
+    paths = [stack([vector_to_weights(start * np.exp(row)) for row in path]) for path in logs]
+
+    def place(weights):
+        """Path and position of weights on its lines; none if they lie on no line."""
+        at = np.log(np.asarray(weights_to_vector(weights)) / start)
+        for number, path in enumerate(logs):
+            for i, (a, b) in enumerate(zip(path, path[1:], strict=False)):
+                share = (at - a) @ (b - a) / ((b - a) @ (b - a))
+                if 0.0 <= share <= 1.0 and np.allclose(at, a + share * (b - a), atol=1e-9):
+                    return number, i + share
+            if np.allclose(at, path[-1], atol=1e-9):
+                return number, len(path) - 1.0
+        return None
+
+    found = [place(job.weights) for job in draw_jobs(0, 300, paths)]
+    assert [p is not None for p in found] == [i // len(KINDS) % 3 == 2 for i in range(300)]
+    places = {k: np.array([p[1] for p in found if p and p[0] == k]) for k in range(3)}
+    assert min(map(len, places.values())) > 15
+    assert set(places[2]) == {0.0}  # a path that ended at its start
+    whole = np.sort(places[0])
+    assert np.abs(whole - np.linspace(0, 4, len(whole))).max() < 1.0  # even along the path
+    assert (np.abs(whole - np.round(whole)) > 1e-3).mean() > 0.9
 
 
 def test_named_commands_are_walked_unchanged():

@@ -1,36 +1,53 @@
 """DiffTune: how far it steps, what it refuses, when it stops; on a toy and on the rigid body."""
 
+from dataclasses import replace
+from functools import partial
 from typing import get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
 from hector_jax.cli.flags import Tunables
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.mpc import MpcConfig
-from hector_jax.control.parameters import GROUPS, TUNABLES, bounds
+from hector_jax.control.parameters import (
+    GROUPS,
+    TUNABLES,
+    bounds,
+    step_bounds,
+    step_names,
+    stepped,
+)
 from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
+from hector_jax.control.weights import (
+    directions,
+    expert,
+    nominal,
+    vector_to_weights,
+    weights_to_vector,
+)
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Wrench
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
-from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import (
+    LEAST_GAIN,
     TuneConfig,
+    descend,
     init,
     rejection_reason,
-    relative_step,
-    step_weights,
+    stop_reason,
     tune,
+    update,
+    weights_at,
 )
-from hector_jax.tuning.evaluate import Evaluation, aligned, mean_over_commands
+from hector_jax.tuning.evaluate import Evaluation, Objective, aligned, mean_objective
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.status import Stop
 
 ROBOT = load_robot()
 ANCHOR = standing_anchor(ROBOT)
@@ -56,79 +73,87 @@ def evaluation(loss=1.0, gradient=None, fallen=0.0, residual=1e-12):
 # One step
 
 
-def test_the_largest_move_is_beta_of_the_weight_itself():
-    weights, gradient = expert(), random_tree(1)
-    update = relative_step(0.05, 0.08)
-    moves, _ = update.update(gradient, update.init(weights), weights)
-    share = vector(moves) / vector(weights)
-    assert np.abs(share[:12]).max() == pytest.approx(0.05)
-    assert np.abs(share[12:]).max() == pytest.approx(0.08)
-    np.testing.assert_array_equal(np.sign(share), -np.sign(vector(gradient)))
-    # inside Q and inside R the moves are in the ratio of the gradient in log-weights
-    logs = vector(gradient) * vector(weights)
-    np.testing.assert_allclose(share[:12] / share[0], logs[:12] / logs[0])
-    np.testing.assert_allclose(share[12:] / share[12], logs[12:] / logs[12])
+def stepped_once(gradient, config, start=None, others=()):
+    """The weights after one step from a start, by `init` and `update`."""
+    state = init(config, nominal() if start is None else start)
+    after, _ = update(config, state, evaluation(gradient=gradient), state.rule.matrix)
+    return weights_at(config, state.start, after.steps)
 
 
-def test_the_size_of_the_loss_does_not_matter():
-    one, other = (
-        step_weights(TuneConfig(), nominal(), random_tree(2, scale), 1.0) for scale in (1.0, 1e9)
-    )
-    np.testing.assert_allclose(vector(one), vector(other), rtol=1e-12)
+RELATIVE = TuneConfig(rule="relative")
 
 
-def test_a_zero_gradient_moves_nothing():
-    still = step_weights(TuneConfig(), nominal(), random_tree(0, 0.0), 1.0)
-    np.testing.assert_array_equal(vector(still), vector(nominal()))
+def mean_over_feet(gradient):
+    return gradient._replace(R=jax.tree.map(lambda g: jnp.stack([g.mean(axis=0)] * 2), gradient.R))
 
 
-def test_a_share_of_the_step_is_that_share_of_the_move():
-    full, half = (
-        vector(step_weights(TuneConfig(), nominal(), random_tree(3), share)) - vector(nominal())
-        for share in (1.0, 0.5)
-    )
-    np.testing.assert_allclose(half, full / 2, rtol=1e-9)
+def test_the_relative_step_is_theta_less_beta_theta_g_over_the_largest_g_of_its_block():
+    for start in (nominal(), expert()):
+        gradient, theta = random_tree(1), vector(start)
+        g = vector(mean_over_feet(gradient)) * theta  # in log-weights
+        largest = np.repeat([np.abs(g[:12]).max(), np.abs(g[12:]).max()], 12)
+        expected = theta - np.repeat([0.05, 0.08], 12) * theta * g / largest
+        moved = stepped_once(gradient, RELATIVE, start)
+        np.testing.assert_allclose(vector(moved), expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize("side", [0, 1])
-def test_a_step_out_of_the_box_ends_on_its_wall(side):
-    edge = bounds()[side]
-    gradient = jax.tree.map(lambda w: np.full_like(w, 1.0 if side == 0 else -1.0), edge)
-    there = step_weights(TuneConfig(), edge, gradient, 1.0)
-    np.testing.assert_array_equal(vector(there), vector(edge))
-    back = step_weights(TuneConfig(), edge, jax.tree.map(np.negative, gradient), 1.0)
-    assert (vector(back) != vector(edge)).all()
-
-
-def test_both_feet_keep_the_same_weights_unless_untied():
-    for tie in (True, False):
-        weights = nominal()
-        for seed in range(3):
-            weights = step_weights(TuneConfig(tie_feet=tie), weights, random_tree(seed), 1.0)
-        assert all(np.array_equal(w[0], w[1]) for w in weights.R) == tie
-
-
-def test_the_tied_step_is_that_of_the_mean_gradient():
-    gradient = random_tree(4)
-    mean = gradient._replace(R=jax.tree.map(lambda g: jnp.stack([g.mean(axis=0)] * 2), gradient.R))
-    tied = step_weights(TuneConfig(), nominal(), gradient, 1.0)
-    expected = step_weights(TuneConfig(tie_feet=False), nominal(), mean, 1.0)
-    np.testing.assert_allclose(vector(tied), vector(expected), rtol=1e-12)
-
-
-def test_the_literal_update_is_the_papers():
-    config = TuneConfig(update="literal", tie_feet=False)
+def test_the_literal_step_is_theta_less_beta_times_the_gradient():
     gradient = random_tree(5, 1e-4)
-    moved = step_weights(config, nominal(), gradient, 1.0)
-    beta = np.repeat([0.05, 0.08], 12)
-    expected = vector(nominal()) - beta * vector(gradient)
-    np.testing.assert_allclose(vector(moved), np.clip(expected, *map(vector, bounds())))
+    moved = stepped_once(gradient, TuneConfig(rule="literal"))
+    expected = vector(nominal()) - np.repeat([0.05, 0.08], 12) * vector(mean_over_feet(gradient))
+    np.testing.assert_allclose(vector(moved), np.clip(expected, *map(vector, bounds())), rtol=1e-12)
 
 
-def test_the_relative_step_asks_for_the_weights():
-    update = relative_step(0.1, 0.1)
-    with pytest.raises(ValueError, match="needs the weights"):
-        update.update(random_tree(0), optax.EmptyState())
+@pytest.mark.parametrize("rule", ["gauss_newton", "relative"])
+def test_the_size_of_the_loss_does_not_matter(rule):
+    config, state = TuneConfig(rule=rule), init(TuneConfig(rule=rule), nominal())
+    found = [evaluation(loss=k, gradient=random_tree(2, k)) for k in (1.0, 1e9)]
+    one, other = (
+        update(config, state, each, k * jnp.eye(18))[0].steps
+        for each, k in zip(found, (1.0, 1e9), strict=True)
+    )
+    np.testing.assert_allclose(one, other, rtol=1e-9)
+
+
+@pytest.mark.parametrize("rule", ["gauss_newton", "relative", "literal"])
+def test_a_zero_gradient_moves_nothing(rule):
+    still = stepped_once(random_tree(0, 0.0), TuneConfig(rule=rule))
+    np.testing.assert_allclose(vector(still), vector(nominal()), rtol=1e-15)
+
+
+@pytest.mark.parametrize("rule", ["gauss_newton", "relative", "literal"])
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_step_out_of_the_box_ends_exactly_on_its_wall(side, rule):
+    config, edge = TuneConfig(rule=rule), bounds()[side]
+    gradient = jax.tree.map(lambda w: np.full_like(w, 1.0 if side == 0 else -1.0), edge)
+    there = stepped_once(gradient, config, edge)
+    np.testing.assert_array_equal(vector(there), vector(edge))
+    back = stepped_once(jax.tree.map(np.negative, gradient), config, edge)
+    assert (vector(back) != vector(edge)).all()
+    near = jax.tree.map(lambda w: w * (1.001 if side == 0 else 0.999), edge)
+    huge = jax.tree.map(lambda g, w: 1e9 * g / w, gradient, near)
+    np.testing.assert_array_equal(vector(stepped_once(huge, config, near)), vector(edge))
+
+
+def test_steps_and_their_bounds_meet_the_box_and_come_back():
+    others = ("turn_lead", "footstep_feedback")
+    start = WalkConfig().with_others(expert(), others)
+    names = step_names(start, others)
+    assert names[-2:] == others
+    assert len(names) == 20
+    for edge, limit in zip(step_bounds(start, others), bounds(others, start), strict=True):
+        reached = stepped(start, edge, others)
+        np.testing.assert_allclose(vector(reached), vector(limit), rtol=1e-12)
+        for name in others:
+            assert float(reached.others[name]) == pytest.approx(limit.others[name], abs=1e-15)
+    steps = np.random.default_rng(0).normal(size=20)
+    moved = stepped(start, steps, others)
+    np.testing.assert_allclose(
+        directions().T @ steps[:18], np.log(vector(moved) / vector(start)), rtol=1e-12
+    )
+    jax.tree.map(
+        partial(np.testing.assert_allclose, rtol=1e-12), stepped(moved, -steps, others), start
+    )
 
 
 # Refusals
@@ -162,120 +187,180 @@ def test_a_gradient_with_one_nan_is_refused():
 OPTIMUM = vector(nominal()) * np.exp(
     np.r_[np.linspace(-0.7, 0.9, 12), np.tile([0.3, -0.5, 0.8], 2), np.tile([0.2, 0.6, -0.4], 2)]
 )
+EXACT = TuneConfig(ridge=0.0)
 
 
-def quadratic(fixed=0.0, optimum=OPTIMUM, falls=lambda weights: False):
-    def toy(config, robot, weights, command, anchor, effect):
+def quadratic(fixed=0.0, optimum=OPTIMUM, falls=lambda weights: False, stiffness=1.0):
+    """1e6 |log(theta / optimum)|^2; the model takes it to be `stiffness` times as curved."""
+
+    def evaluate(weights):
         away = np.log(vector(weights) / optimum)
         gradient = vector_to_weights(jnp.asarray(2e6 * away / vector(weights)))
         return evaluation(fixed + 1e6 * away @ away, gradient, float(falls(weights)))
 
-    return toy
+    return Objective(evaluate, lambda weights: stiffness * 2e6 * directions() @ directions().T)
 
 
-def tune_toy(monkeypatch, toy, config=TuneConfig(), start=None, **more):  # noqa: B008
-    monkeypatch.setattr(difftune, "tune_step", toy)
-    start = nominal() if start is None else start
-    return tune(config, ROBOT, start, STRAIGHT, ANCHOR, last_command, **more)
+def tune_toy(toy, config=EXACT, start=None, **more):
+    return descend(config, nominal() if start is None else start, toy, **more)
 
 
 def distance(weights):
     return np.abs(np.log(vector(weights) / OPTIMUM)).max()
 
 
-def test_a_quadratic_is_tuned_to_its_optimum(monkeypatch):
-    found = tune_toy(monkeypatch, quadratic())
-    assert distance(found.converged) < 0.01
-    assert distance(found.converged) < distance(found.ten) < distance(nominal())
-    assert found.stop == "the step became too small to gain"
+def test_a_quadratic_is_tuned_to_its_optimum_in_a_few_steps():
+    found = tune_toy(quadratic())
+    assert distance(found.weights) < 1e-6
+    assert float(found.iterations[4].evaluation.loss) < 1e-6
 
 
-def test_ten_are_the_weights_after_the_papers_ten_iterations(monkeypatch):
-    found = tune_toy(monkeypatch, quadratic())
-    np.testing.assert_array_equal(vector(found.ten), vector(found.history[10].weights))
-    steps = [vector(i.weights) for i in found.history[:11]]
-    share = np.abs(np.diff(np.log(steps), axis=0)).max(axis=1)
-    assert ((share > 0.04) & (share < 0.09)).all()
-    only = tune_toy(monkeypatch, quadratic(), TuneConfig(iterations=10))
-    assert only.stop == "10 iterations"
-    np.testing.assert_array_equal(vector(only.ten), vector(only.converged))
-    np.testing.assert_array_equal(vector(only.ten), vector(found.ten))
+@pytest.mark.parametrize("rule", ["relative", "literal"])
+def test_the_papers_ten_steps_are_taken_uphill_too(rule):
+    start = vector_to_weights(jnp.asarray(OPTIMUM * 1.01))
+    found = tune_toy(quadratic(), TuneConfig(rule=rule), start)
+    assert stop_reason(RELATIVE, found.stop) == "10 iterations"
+    losses = [float(i.evaluation.loss) for i in found.iterations]
+    assert all(i.accepted for i in found.iterations)
+    assert len(losses) == 11
+    assert (np.diff(losses) > 0).any()
 
 
-def test_the_papers_ten_steps_are_taken_uphill_too_and_later_ones_are_not(monkeypatch):
-    found = tune_toy(monkeypatch, quadratic(), start=vector_to_weights(jnp.asarray(OPTIMUM * 1.01)))
-    losses = [float(i.evaluation.loss) for i in found.history]
-    assert all(i.accepted for i in found.history[:11])
-    assert (np.diff(losses[:11]) > 0).any()
-    late = found.history[11:]
-    assert any(i.reason == "the loss rose" for i in late)
-    kept = [losses[10]] + [float(i.evaluation.loss) for i in late if i.accepted]
-    assert (np.diff(kept) < 0).all()
+def test_a_ridge_keeps_the_optimum_nearer_to_the_start_as_its_formula_has_it():
+    """Of L / L(0) + ridge / 2 |z|^2 with L = 1e6 |z_feet - z*|^2."""
+    ridge = 0.5
+    found = tune_toy(quadratic(), TuneConfig(ridge=ridge, iterations=30))
+    aim, spread = np.log(OPTIMUM / vector(nominal())), directions() @ directions().T
+    first = aim @ aim
+    expected = np.linalg.solve(
+        2 * spread / first + ridge * np.eye(18), 2 * directions() @ aim / first
+    )
+    np.testing.assert_allclose(
+        directions().T @ expected, np.log(vector(found.weights) / vector(nominal())), atol=1e-3
+    )
+    np.testing.assert_allclose(
+        found.precision, 2 * spread / first + ridge * np.eye(18), rtol=1e-9, atol=1e-9
+    )
 
 
-def test_a_late_step_to_the_same_loss_gains_nothing(monkeypatch):
-    level = lambda *model, **inputs: evaluation(1e5)  # noqa: E731
-    found = tune_toy(monkeypatch, level, TuneConfig(iterations=12))
-    assert [i.accepted for i in found.history] == [True] * 11 + [False]
-    assert found.history[-1].reason == "the loss rose"
+@pytest.mark.parametrize(("share", "ended"), [(0.99, True), (1.01, False)])
+def test_it_stops_where_the_next_step_is_predicted_to_gain_too_little(share, ended):
+    """Of the whole loss, of which no weight changes the largest part."""
+    start = vector_to_weights(jnp.asarray(OPTIMUM * 1.1))
+    gain = 1e6 * 24 * np.log(1.1) ** 2
+    found = tune_toy(quadratic(fixed=gain * (1.0 / (share * LEAST_GAIN) - 1.0)), start=start)
+    assert (len(found.iterations) == 1) == ended
+    assert Stop(int(found.stop)) == Stop.NO_GAIN
+    assert stop_reason(EXACT, found.stop).endswith("predicted to gain less than 0.5%")
 
 
-@pytest.mark.parametrize(("patience", "last"), [(5, 11), (15, 15)])
-def test_it_stops_where_nothing_is_gained(monkeypatch, patience, last):
-    config = TuneConfig(patience=patience, gain=5e-3)
-    found = tune_toy(monkeypatch, quadratic(fixed=1e12), config)
-    assert found.stop == f"the loss fell by less than 0.5% in {patience} iterations"
-    assert sum(one.accepted for one in found.history) - 1 == last
+def test_two_wrong_predictions_in_a_row_end_it():
+    """The loss is so much more curved than predicted that the gains are a fifth."""
+    start = vector_to_weights(jnp.asarray(OPTIMUM * 1.05))
+    found = tune_toy(quadratic(stiffness=1 / 1.8), start=start)
+    assert Stop(int(found.stop)) == Stop.ROUGH
+    assert [i.accepted for i in found.iterations] == [True, True, True]
+    assert stop_reason(EXACT, found.stop) == "2 steps in a row did not gain what was predicted"
 
 
-def test_a_fall_halves_the_step_goes_back_and_is_told(monkeypatch):
+def test_a_limit_ends_it():
+    found = tune_toy(quadratic(stiffness=3.0), TuneConfig(iterations=2, ridge=0.0))
+    assert [int(i.iteration) for i in found.iterations] == [0, 1, 2]
+    assert Stop(int(found.stop)) == Stop.LIMIT
+    assert stop_reason(TuneConfig(iterations=2), found.stop) == "2 iterations"
+
+
+def test_a_fall_shortens_the_step_goes_back_is_told_and_is_no_wrong_prediction():
     wall = 1.12 * nominal().Q.velocity[2]
     toy = quadratic(falls=lambda weights: weights.Q.velocity[2] > wall)
     seen = []
-    found = tune_toy(monkeypatch, toy, TuneConfig(iterations=30), on_iteration=seen.append)
-    refused = [i for i in found.history if not i.accepted]
-    assert seen == found.history
-    assert refused
-    assert {i.reason for i in refused} <= {"the robot fell", "the loss rose"}
-    assert any(i.reason == "the robot fell" for i in refused)
-    best = found.history[0]
-    for before, now in zip(found.history, found.history[1:], strict=False):
-        best = before if before.accepted else best
-        expected = step_weights(
-            TuneConfig(), best.weights, best.evaluation.gradient, float(now.step_scale)
-        )
-        np.testing.assert_array_equal(vector(now.weights), vector(expected))
-        if before.step_scale:
-            wanted = min(1.0, 2.0 * before.step_scale) if before.accepted else before.step_scale / 2
-            assert now.step_scale == wanted
-    for weights in (found.ten, found.converged):
-        assert weights.Q.velocity[2] <= wall
+    found = tune_toy(toy, TuneConfig(ridge=0.0, iterations=30), on_iteration=seen.append)
+    history = found.iterations
+    refused = [i for i in history if not i.accepted]
+    jax.tree.map(np.testing.assert_array_equal, seen, history)
+    assert len(refused) >= 3
+    assert {i.reason for i in refused} == {"the robot fell"}
+    assert Stop(int(found.stop)) != Stop.ROUGH
+    for before, now in zip(history[1:], history[2:], strict=False):
+        if not before.accepted:
+            assert float(now.step_size) == pytest.approx(float(before.step_size) / 3)
+    at = history[0]
+    for now in history[1:]:
+        away = np.linalg.lstsq(directions().T, np.log(vector(now.weights) / vector(at.weights)))[0]
+        assert np.linalg.norm(away) <= now.step_size * (1 + 1e-9)
+        at = now if now.accepted else at
+    np.testing.assert_array_equal(vector(found.weights), vector(at.weights))
+    assert found.weights.Q.velocity[2] <= wall
+    assert float(found.loss) == float(at.evaluation.loss)
 
 
-def test_each_iteration_is_numbered_and_the_first_is_the_start(monkeypatch):
-    found = tune_toy(monkeypatch, quadratic(), TuneConfig(iterations=12))
-    assert [i.iteration for i in found.history] == list(range(len(found.history)))
-    np.testing.assert_array_equal(vector(found.history[0].weights), vector(nominal()))
-    assert found.history[0].step_scale == 0.0
+def test_a_step_that_gains_less_than_a_hundredth_of_the_prediction_is_refused():
+    level = quadratic()._replace(evaluate=lambda weights: evaluation(1.0, random_tree(1)))
+    level = level._replace(matrix=lambda weights: jnp.eye(18))
+    found = tune_toy(level)
+    assert [i.accepted for i in found.iterations] == [True, False, False]
+    assert found.iterations[-1].reason == "the loss did not fall as predicted"
+    assert Stop(int(found.stop)) == Stop.ROUGH
+    np.testing.assert_array_equal(vector(found.weights), vector(nominal()))
 
 
-def test_a_start_that_falls_is_refused(monkeypatch):
+def test_the_matrix_is_taken_where_a_step_was_accepted_and_nowhere_else():
+    wall, taken = 1.12 * nominal().Q.velocity[2], []
+    toy = quadratic(falls=lambda weights: weights.Q.velocity[2] > wall)
+
+    def matrix(weights):
+        taken.append(vector(weights))
+        return toy.matrix(weights)
+
+    config = TuneConfig(iterations=30)
+    found = tune_toy(toy._replace(matrix=matrix), config)
+    np.testing.assert_array_equal(
+        taken, [vector(i.weights) for i in found.iterations if i.accepted]
+    )
+    taken.clear()
+    tune_toy(toy._replace(matrix=matrix), RELATIVE)
+    assert taken == []
+
+
+def test_each_iteration_is_numbered_and_the_first_is_the_start():
+    for config in (EXACT, RELATIVE):
+        found = tune_toy(quadratic(), config)
+        history = found.iterations
+        assert [int(i.iteration) for i in history] == list(range(len(history)))
+        np.testing.assert_array_equal(vector(history[0].weights), vector(nominal()))
+        assert [float(i.step_size) for i in history[:2]] == [0.0, 1.0]
+
+
+def test_a_start_that_falls_is_refused():
+    seen = []
     with pytest.raises(ValueError, match="the starting weights cannot be tuned from: the robot"):
-        tune_toy(monkeypatch, quadratic(falls=lambda weights: True))
+        tune_toy(quadratic(falls=lambda weights: True), on_iteration=seen.append)
+    assert len(seen) == 1
 
 
-def test_an_optimum_outside_the_box_ends_on_its_wall(monkeypatch):
+def test_the_papers_steps_end_where_all_are_refused():
+    toy = quadratic(falls=lambda w: not np.array_equal(vector(w), vector(nominal())))
+    found = tune_toy(toy, TuneConfig(rule="relative", iterations=30))
+    assert Stop(int(found.stop)) == Stop.SMALL_STEP
+    assert [float(i.step_size) for i in found.iterations[1:]] == [0.5**i for i in range(8)]
+    np.testing.assert_array_equal(vector(found.weights), vector(nominal()))
+
+
+@pytest.mark.parametrize("rule", ["gauss_newton", "relative"])
+def test_an_optimum_outside_the_box_ends_on_its_wall(rule):
     outside = OPTIMUM.copy()
     outside[3] = 1e6
     start = vector_to_weights(jnp.asarray(OPTIMUM).at[3].set(9e3))
-    found = tune_toy(monkeypatch, quadratic(optimum=outside), start=start)
-    assert found.converged.Q.position[0] == 1e4
-    assert max(i.weights.Q.position[0] for i in found.history) == 1e4
+    found = tune_toy(quadratic(optimum=outside), TuneConfig(rule=rule, ridge=0.0), start)
+    assert found.weights.Q.position[0] == 1e4
+    assert max(i.weights.Q.position[0] for i in found.iterations) == 1e4
+    others = np.delete(np.log(vector(found.weights) / OPTIMUM), 3)
+    assert np.abs(others).max() < 0.1
 
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"update": "adam"}, {"beta_q": 0.0}, {"beta_r": -1.0}, {"iterations": 0}, {"patience": 0}],
+    [{"rule": "adam"}, {"beta_q": 0.0}, {"beta_r": -1.0}, {"iterations": 0}, {"ridge": -1e-3}],
 )
 def test_impossible_settings_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
@@ -287,10 +372,13 @@ def test_impossible_settings_are_refused(wrong):
 
 def test_a_start_whose_feet_differ_is_tied_and_stays_tied():
     start = nominal()._replace(R=Wrench(*(w * np.array([[2.0], [0.5]]) for w in nominal().R)))
-    progress = init(TuneConfig(), start)
-    np.testing.assert_allclose(vector(progress.trial), vector(nominal()), rtol=1e-12)
-    free = init(TuneConfig(tie_feet=False), start)
-    np.testing.assert_array_equal(vector(free.trial), vector(start))
+    at = init(TuneConfig(), start).start
+    np.testing.assert_allclose(vector(at), vector(nominal()), rtol=1e-12)
+    found = tune_toy(quadratic(), start=start)
+    for iteration in found.iterations:
+        assert all(np.array_equal(w[0], w[1]) for w in iteration.weights.R)
+    equal = init(TuneConfig(), expert()).start
+    np.testing.assert_array_equal(vector(equal), vector(expert()))  # to the last bit
 
 
 def test_a_loss_is_not_aligned_to_a_term_that_is_not_there():
@@ -318,27 +406,40 @@ def test_a_loss_without_control_is_aligned_to_its_last_term():
     assert {term.name: term.weight for term in found} == {first: 300.0, last: 3.0}
 
 
-def test_the_mean_over_commands_begins_at_the_mean_of_their_losses_with_equal_parts():
-    each = [lambda weights, loss=loss: evaluation(loss) for loss in (1.0, 3.0, 8.0)]
-    found = mean_over_commands(each, nominal())(nominal())
+def test_the_mean_of_objectives_begins_at_the_mean_of_their_losses_with_equal_parts():
+    losses = np.array([1.0, 3.0, 8.0])
+    each = [
+        Objective(
+            lambda weights, k=k: evaluation(k, fallen=k / 10), lambda weights, k=k: k * np.eye(2)
+        )
+        for k in losses
+    ]
+    mean = mean_objective(each, losses)
+    found = mean.evaluate(nominal())
     assert found.loss == pytest.approx(4.0)
-    parts = [vector(random_tree(0)) * 4.0 / loss for loss in (1.0, 3.0, 8.0)]
+    assert found.fallen == 0.8  # the worst
+    parts = [vector(random_tree(0)) * 4.0 / loss for loss in losses]
     np.testing.assert_allclose(vector(found.gradient), np.mean(parts, axis=0))
+    np.testing.assert_allclose(mean.matrix(nominal()), 4.0 * np.eye(2))
+    plain = mean_objective(each)
+    np.testing.assert_allclose(plain.matrix(nominal()), losses.mean() * np.eye(2))
+    np.testing.assert_allclose(
+        vector(plain.evaluate(nominal()).gradient), vector(random_tree(0)), rtol=1e-12
+    )
 
 
 @pytest.mark.slow
 def test_ten_iterations_from_nominal_go_down_inside_the_box():
-    """By a fifth at least was asked for; on straight 16 % is measured (docs/decisions.md)."""
+    """On each trajectory by what a hundred of the paper's steps reach, and more."""
     lower, upper = map(vector, bounds())
-    for name, least in (("straight", 0.15), ("c", 0.2), ("s", 0.2)):
+    for name, least in (("straight", 0.3), ("c", 0.3), ("s", 0.3)):
         command = named_command(name)
-        found = tune(TuneConfig(iterations=10), ROBOT, nominal(), command, ANCHOR, last_command)
-        losses = [float(i.evaluation.loss) for i in found.history]
-        assert len(losses) == 11, name
-        assert losses[-1] <= (1.0 - least) * losses[0], name
-        for iteration in found.history:
+        found = tune(TuneConfig(), ROBOT, nominal(), command, ANCHOR, last_command)
+        history = found.iterations
+        assert len(history) <= 11, name
+        assert float(found.loss) <= (1.0 - least) * float(history[0].evaluation.loss), name
+        for iteration in history:
             at = vector(iteration.weights)
-            assert iteration.accepted, (name, iteration.reason)
             assert ((lower <= at) & (at <= upper)).all(), (name, at)
 
 
@@ -349,24 +450,33 @@ SLIPPERY = RolloutConfig(WalkConfig(mpc=MpcConfig(friction=0.05)))
 
 
 def test_other_numbers_step_by_a_share_of_their_box_and_what_is_not_tuned_stays():
-    config = TuneConfig(others=("turn_lead", "footstep_feedback"))
-    start = init(config, nominal()._replace(others={"friction": 0.4})).trial
-    assert {name: float(x) for name, x in start.others.items()} == {
+    config = TuneConfig(rule="relative", others=("turn_lead", "footstep_feedback"))
+    start = nominal()._replace(others={"friction": 0.4})
+    assert {name: float(x) for name, x in init(config, start).start.others.items()} == {
         "footstep_feedback": 0.12,
         "friction": 0.4,
         "turn_lead": 0.5,
     }
     slopes = {"footstep_feedback": jnp.array(4.0), "friction": 1e9, "turn_lead": jnp.array(-2.0)}
     gradient = random_tree(1)._replace(others=jax.tree.map(jnp.asarray, slopes))
-    moved = step_weights(config, start, gradient, 0.5)
-    without = step_weights(TuneConfig(), nominal(), random_tree(1), 0.5)
+    moved = stepped_once(gradient, config, start)
+    without = stepped_once(random_tree(1), RELATIVE)
     np.testing.assert_array_equal(vector(moved), vector(without))
     # slope times width of the box is 2 and -4: the second takes the whole step
-    assert float(moved.others["turn_lead"]) == pytest.approx(0.5 + 0.5 * 0.02 * 2.0)
-    assert float(moved.others["footstep_feedback"]) == pytest.approx(0.12 - 0.5 * 0.02 * 0.25)
+    assert float(moved.others["turn_lead"]) == pytest.approx(0.5 + 0.02 * 2.0)
+    assert float(moved.others["footstep_feedback"]) == pytest.approx(0.12 - 0.02 * 0.25)
     assert moved.others["friction"] == 0.4
-    far = step_weights(config, start, gradient, 100.0)
+    far = stepped_once(gradient, replace(config, beta_others=10.0), start)
     assert far.others["turn_lead"] == 2.0
+
+
+def test_a_trust_region_holds_shares_of_boxes_as_it_holds_logs():
+    config = TuneConfig(others=("turn_lead",))
+    slope = random_tree(0, 0.0)._replace(others={"turn_lead": jnp.array(-100.0)})
+    moved = stepped_once(slope, config)
+    # a gradient without curvature: to the radius of 1, a whole box, and so to the wall
+    assert moved.others["turn_lead"] == 2.0
+    np.testing.assert_allclose(vector(moved), vector(nominal()), rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -376,8 +486,8 @@ def test_other_numbers_step_by_a_share_of_their_box_and_what_is_not_tuned_stays(
         ({"others": ("foot_height",)}, "foot_height cannot be tuned by gradients"),
         ({"others": ("position_limit",)}, "position_limit cannot be tuned by gradients"),
         (
-            {"others": ("friction",), "update": "literal"},
-            "others must be empty with update literal",
+            {"others": ("friction",), "rule": "literal"},
+            "others must be empty with the rule literal",
         ),
         (
             {"others": ("turn_lead",), "rollout": PAPERS},

@@ -7,6 +7,7 @@ from hector_jax.core import inputs
 from hector_jax.core.inputs import InputError
 from hector_jax.search.few_walks import (
     METHODS,
+    Model,
     WalkResult,
     incumbent,
     needs_model,
@@ -20,16 +21,30 @@ SPACE = space_of(MATRIX, np.tile([-3.0, 3.0], (SIZE, 1)))
 GOAL = np.array([0.8, -0.6, 0.5, 0.4, -0.7])  # in steps
 
 
+SCALE = np.append(np.diag(MATRIX), 1.0) + 0.3
+
+
 def bowl(goal, point):
     """A log-loss with its least value, 0, at a goal, and its gradient."""
     away = SPACE.to_steps @ point - goal
-    scale = np.append(np.diag(MATRIX), 1.0) + 0.3
-    return 0.5 * away @ (scale * away), SPACE.to_steps.T @ (scale * away)
+    return 0.5 * away @ (SCALE * away), SPACE.to_steps.T @ (SCALE * away)
 
 
-def model(point):
-    """Wrong about where the goal is, and does not feel the last number."""
-    return bowl(GOAL * [0.8, 0.8, 0.5, 0.0, 0.0], point)
+def model_of(goal):
+    """A model whose loss is that bowl about a goal."""
+
+    def evaluate(point):
+        log, gradient = bowl(goal, point)
+        return np.exp(log), np.exp(log) * gradient
+
+    def matrix(point):
+        return evaluate(point)[0] * SPACE.to_steps.T @ np.diag(SCALE) @ SPACE.to_steps
+
+    return Model(evaluate, matrix)
+
+
+# wrong about where the goal is, and does not feel the last number
+model = model_of(GOAL * [0.8, 0.8, 0.5, 0.0, 0.0])
 
 
 def walked(proposal, loss, margin=0.1):
@@ -90,7 +105,7 @@ def test_a_model_that_repeats_itself_gives_way_to_the_surrogate_nearby():
     """Its predictions made the region large, which the surrogate has not earned."""
     history = []
     for _ in range(10):
-        proposal = propose(SPACE, history, lambda point: bowl(0.5 * GOAL, point))
+        proposal = propose(SPACE, history, model_of(0.5 * GOAL))
         if proposal.method == "surrogate":
             break
         history.append(walked(proposal, bowl(0.5 * GOAL, proposal.point)[0]))

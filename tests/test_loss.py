@@ -184,7 +184,7 @@ def test_a_fourth_term_is_tuned_told_and_written_from_one_place():
     tuning = tune(
         config, robot, nominal(), named_command("s"), standing_anchor(robot), last_command
     )
-    first = tuning.history[0]
+    first = tuning.iterations[0]
     terms = first.evaluation.terms
     assert terms["L_sway"] > 0.0
     assert first.evaluation.loss == pytest.approx(float(total(loss, terms)))

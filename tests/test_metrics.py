@@ -127,8 +127,8 @@ def test_the_seeds_of_a_result_are_its_plants_and_its_falls_and_wins_are_walks()
     found = metrics.as_result(verdict)["sets"]["with"]["standin"]
     assert (found["seeds"], found["scenes"]) == ([0, 1, 2, 3], ["straight", "c", "s"])
     assert found["falls"] == 3
-    losses = (verdict.scores[name].L for name in ("with", "without_ten"))
-    wins = metrics.compare(verdict, "with", "without_ten").wins
+    losses = (verdict.scores[name].L for name in ("with", "without"))
+    wins = metrics.compare(verdict, "with", "without").wins
     assert wins == np.mean(np.less(*losses))
     assert np.shape(verdict.scores["with"].L) == (4, 3)
 

@@ -21,7 +21,14 @@ from hector_jax.control.contact import (
     StateConstraint,
 )
 from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
-from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, build_qp, solve_mpc
+from hector_jax.control.mpc import (
+    Horizon,
+    MpcConfig,
+    MpcProblem,
+    build_qp,
+    half_slope,
+    solve_mpc,
+)
 from hector_jax.control.parameters import bounds
 from hector_jax.control.weights import (
     Weights,
@@ -34,7 +41,7 @@ from hector_jax.core.geometry import rot_z
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import from_table
 from hector_jax.core.trajectory import State, Wrench, pack_wrench, unpack_wrench
-from hector_jax.qp import QP, Status
+from hector_jax.qp import QP, Status, solve_qp
 from hector_jax.robot import srbm
 from hector_jax.robot.model import load_robot
 from hector_jax.runs.cache import content_key
@@ -484,6 +491,59 @@ def test_a_batch_is_a_loop():
     for i, (state, horizon) in enumerate(cases):
         one, _ = solve(CONFIG, expert(), state, horizon, 1)
         np.testing.assert_allclose(batch.force[i], one.force, atol=1e-7)
+
+
+@pytest.mark.parametrize(("contacts", "stance"), [(1, None), (2, None), (2, BOTH)])
+@pytest.mark.parametrize("about", ["zero", "gravity"])
+def test_the_slope_without_the_matrix_is_that_of_the_qp(contacts, stance, about):
+    """P v + q, at any inputs; with one foot on the ground where there is room for two as well."""
+    state, horizon = problem(5, contact=stance)
+    lacking = Disturbance(np.array([0.3, -0.2, 0.5]), np.array([1.0, 2.0, -1.0]))
+    config, weights = MpcConfig(effort_reference=about), random_weights(5)
+    qp, condensed = answer(config, weights, state, horizon, contacts, lacking)[1]
+    asked = MpcProblem(ROBOT, config.parameters(weights), state, horizon, lacking)
+    for v in np.random.default_rng(0).normal(size=(3, N * 5 * contacts)) * 30.0:
+        half = half_slope(CONFIG, asked, condensed, jnp.asarray(v.reshape(N, -1)))
+        expected = qp.P @ v + qp.q
+        np.testing.assert_allclose(
+            2 * half.ravel(), expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max()
+        )
+
+
+@pytest.mark.parametrize("contacts", [1, 2])
+def test_the_derivative_without_the_matrix_is_that_of_the_qp(contacts):
+    """In the weights, the state and the levers, of all inputs at once, in both modes."""
+    state, horizon = problem(6, push=2.0, contact=None if contacts == 1 else BOTH)
+    what = {"dt": DT, "max_contacts": contacts}
+
+    def asked(logs, shift, lever):
+        weights = vector_to_weights(weights_to_vector(expert()) * jnp.exp(logs))
+        moved = state._replace(position=state.position + shift)
+        level = horizon._replace(lever=horizon.lever + lever)
+        return MpcProblem(ROBOT, CONFIG.parameters(weights), moved, level, NO_DISTURBANCE)
+
+    def with_slope(*at):
+        return solve_mpc(CONFIG, asked(*at), **what)[1].x
+
+    def with_matrix(*at):
+        return solve_qp(build_qp(CONFIG, asked(*at), **what)[0], CONFIG.qp).x
+
+    at = jnp.zeros(24), jnp.zeros(3), jnp.zeros(3)
+    rng = np.random.default_rng(0)
+    along = tuple(jnp.asarray(rng.normal(size=x.shape)) for x in at)
+    pull = jnp.asarray(rng.normal(size=N * 5 * contacts))
+    forward, reverse = [], []
+    for function in (with_slope, with_matrix):
+        forward.append(jax.jit(lambda f=function: jax.jvp(f, at, along))())
+        reverse.append(jax.jit(lambda f=function: jax.vjp(f, *at)[1](pull))())
+    np.testing.assert_array_equal(forward[0][0], forward[1][0])
+    size = np.abs(forward[1][1]).max()
+    assert size > 0.1
+    np.testing.assert_allclose(forward[0][1], forward[1][1], atol=1e-8 * size)
+    for one, other in zip(*reverse, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-8 * np.abs(other).max())
+    both = sum(float(jnp.vdot(g, d)) for g, d in zip(reverse[0], along, strict=True))
+    assert both == pytest.approx(float(pull @ forward[0][1]), rel=1e-8)
 
 
 def test_u_is_packed_forces_first():

@@ -18,7 +18,13 @@ from synthetic import synthetic_walk
 from hector_jax.cli import commands, flags
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
-from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
+from hector_jax.control.weights import (
+    directions,
+    expert,
+    nominal,
+    vector_to_weights,
+    weights_to_vector,
+)
 from hector_jax.core import environment
 from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import read_card
@@ -37,7 +43,7 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.evaluate import Evaluation, mean_over_commands
+from hector_jax.tuning.evaluate import Evaluation, mean_objective
 from hector_jax.tuning.rollout import RolloutConfig
 
 
@@ -188,6 +194,9 @@ def test_a_net_is_stored_by_its_variant(tmp_path, robot, quick, monkeypatch):
     assert isinstance(ground(tmp_path, robot, "paper").params, PaperParams)
 
 
+SHARED = directions() @ directions().T  # curvature of |log(theta)|^2 / 2 in the log-steps
+
+
 def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, monkeypatch):
     """Quadratics of the log-weights, of very different size."""
     sizes = {"c": 1.0, "s": 1e3}
@@ -202,12 +211,16 @@ def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, m
         terms = dict.fromkeys(("L_Eul", "L_pos", "L_ctrl"), loss)
         return Evaluation(loss, terms, gradient, np.array(0.0), np.array(0.0))
 
+    def matrix(config, robot, weights, command, **model):
+        return 2.0 * float(command.duration[0]) * SHARED
+
     monkeypatch.setattr(tunings.difftune, "tune_step", tune_step)
+    monkeypatch.setattr(tunings.difftune, "gauss_newton_jit", matrix)
     told, config = SimpleQueue(), TuneConfig(iterations=12)
     for others in ((), (commands[1],)):
         problem = tunings.Problem((commands[0], *others), None)
         found = tunings._tune_job(config, robot, nominal(), problem, "with", told)
-        first = found.history[0].evaluation
+        first = found.iterations[0].evaluation
         each = [tune_step(None, None, nominal(), c, None, None) for c in (commands[0], *others)]
         mean = np.mean([one.loss for one in each])
         assert first.loss == pytest.approx(mean, rel=1e-12)
@@ -215,7 +228,10 @@ def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, m
         for i, gradient in enumerate(jax.tree.leaves(first.gradient)):
             parts = [jax.tree.leaves(e.gradient)[i] / k for e, k in zip(each, scales, strict=True)]
             np.testing.assert_allclose(gradient, np.mean(parts, axis=0), rtol=1e-12)
-        assert found.history[-1].evaluation.loss < first.loss
+        assert found.loss < first.loss
+        curved = [*sizes.values()][: len(scales)] / np.array(scales if others else [1.0])
+        expected = 2.0 * curved.mean() * SHARED / first.loss + config.ridge * np.eye(18)
+        np.testing.assert_allclose(found.precision, expected, rtol=1e-12)
         if not others:  # a single one to the last bit
             jax.tree.map(np.testing.assert_array_equal, first, each[0])
 
@@ -223,7 +239,7 @@ def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, m
 def test_what_takes_the_mean_over_commands_is_in_the_key_of_a_tuning():
     source = environment._source("tuning.difftune").read_bytes()
     modules = {*tunings.TUNING_CODE, *environment._imported(ast.parse(source))}
-    assert mean_over_commands.__module__.removeprefix("hector_jax.") in modules
+    assert mean_objective.__module__.removeprefix("hector_jax.") in modules
 
 
 def test_a_tuning_that_fails_is_told_while_others_go_on(tmp_path, monkeypatch, robot):

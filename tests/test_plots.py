@@ -98,7 +98,7 @@ def test_the_four_sets_of_most_pictures_stay_apart_in_grey():
 
 
 def test_a_legend_begins_with_the_names_of_the_tables():
-    for name in (*FOUR, "with_ten", "shared_mean", "search_2000", "mine"):
+    for name in (*FOUR, "search_200", "shared_mean", "search_2000", "mine"):
         assert label_of(name).split(" (")[0] == name
 
 
@@ -153,8 +153,8 @@ def test_falls_stand_at_the_edge_of_changes_and_do_not_squeeze_the_axis(tmp_path
     one, other = pretend_verdict(8), pretend_verdict(8, fallen={("with", 1), ("with", 3)})
     for verdict in (one, other):
         verdict.scores["with"].L[[1, 3]] *= 1 + 200 * verdict.scores["with"].fallen[[1, 3]]
-    other.scores["mine"] = other.scores["with_ten"]
-    paper = {("c", "with_ten", "nominal"): -68.7}
+    other.scores["mine"] = other.scores["without"]
+    paper = {("c", "without", "nominal"): -68.7}
     table_plots.changes(tmp_path / "changes.png", {"c": one, "s": other}, paper)
     c, s, *_ = drawn[0].axes
     assert [text.get_text() for text in s.texts] == ["2 fell"]
@@ -166,7 +166,7 @@ def test_falls_stand_at_the_edge_of_changes_and_do_not_squeeze_the_axis(tmp_path
     ratio = other.scores["with"].L / other.scores["nominal"].L
     assert any(np.array_equal(x, ratio[~other.scores["with"].fallen]) for x in dots)
     diamonds = next(line for line in c.lines if line.get_marker() == "D")
-    np.testing.assert_allclose(diamonds.get_xydata(), [[0.313, rows.index("with_ten")]])
+    np.testing.assert_allclose(diamonds.get_xydata(), [[0.313, rows.index(label_of("without"))]])
     assert c.get_xlabel() == "change of L against nominal [%]"
 
 

@@ -665,6 +665,31 @@ def test_derivative_is_that_of_an_exact_solver(walking):
     assert np.max(errors) <= 1e-3, np.max(errors)
 
 
+def test_a_slope_that_is_given_has_the_derivative_of_the_default(walking):
+    """Of P = diag(p) + L L', whose product with x needs no matrix."""
+    base, rng = walking[3], np.random.default_rng(0)
+    n = len(base.q)
+    start = np.abs(rng.normal(size=n)) + 1.0, 3.0 * rng.normal(size=(n, 2)), base.q
+    along = tuple(rng.normal(size=x.shape) for x in start)
+
+    def written(p, L, q):
+        return QP(jnp.diag(p) + L @ L.T, q, *base[2:])
+
+    def given(p, L, q):
+        return solve_qp(written(p, L, q), slope=lambda x: p * x + L @ (L.T @ x) + q)
+
+    found = [
+        jax.jit(partial(jax.jvp, function))(start, along)
+        for function in (given, lambda *at: solve_qp(written(*at)))
+    ]
+    for one, other in zip(jax.tree.leaves(found[0][0]), jax.tree.leaves(found[1][0]), strict=True):
+        np.testing.assert_array_equal(one, other)
+    for part in ("x", "y"):
+        one, other = (getattr(tangent, part) for _, tangent in found)
+        assert np.abs(other).max() > 1e-3
+        np.testing.assert_allclose(one, other, atol=1e-9 * np.abs(other).max())
+
+
 def test_forward_and_reverse_are_one_derivative(walking):
     pull = jax.jit(lambda qp, seed: jax.vjp(lambda qp: solve_qp(qp).x, qp)[1](seed)[0])
     for seed in range(10):

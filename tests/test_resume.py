@@ -14,7 +14,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from killed import look
+from killed import toy
 
 from hector_jax.cli import flags, run_folder
 from hector_jax.cli import tune as command
@@ -44,7 +44,7 @@ def tune(folder):
     """A toy tuning that is kept; made anew where it was cut."""
 
     def make(missing, found):
-        yield "toy", descend(CONFIG, nominal(), lambda w: look(folder, w)).converged
+        yield "toy", descend(CONFIG, nominal(), toy(folder)).weights
 
     paths = {"toy": folder / "tuning.npz"}
     return load_or_make(paths, make, like=lambda _: nominal(), kind="weights", robot=ROBOT)["toy"]
@@ -361,7 +361,7 @@ def test_a_run_whose_data_are_elsewhere_is_refused_at_once(begun, tmp_path, monk
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        ({"iterations": 50}, "run: begun with --iterations 100, got 50"),
+        ({"iterations": 50}, "run: begun with --iterations 10, got 50"),
         ({"traj": ("s",)}, "run: begun with --traj c, got s"),
         ({"out": Path("other")}, "only one can be given"),
     ],

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from model import BEST_OTHERS, CONFIG, ROBOT
-from pretend import pretend_history
+from pretend import pretend_tuning
 
 from hector_jax.cli import run_folder
 from hector_jax.cli import tune as command
@@ -17,12 +17,11 @@ from hector_jax.core.inputs import InputError
 from hector_jax.runs import tunings
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Tuned
-from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.loss import alphas
 
 
 def test_the_command_tunes_smoothly_and_takes_a_safe_set(monkeypatch, tmp_path):
-    tuned, seen = Tuned(Tuning(pretend_history(3), nominal(), expert(), "done"), ""), []
+    tuned, seen = Tuned(pretend_tuning(3, expert()), ""), []
 
     def tune(setup, *_, **__):
         seen.append(setup.config)

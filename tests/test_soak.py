@@ -40,27 +40,28 @@ def work():
     jax.monitoring.unregister_event_duration_listener(hear)
 
 
-def test_nothing_is_compiled_after_the_first_iteration(work):
-    """Past the paper's ten iterations, to the end, on another trajectory and with another net."""
+@pytest.mark.parametrize("rule", ["gauss_newton", "relative"])
+def test_nothing_is_compiled_after_the_first_iteration(work, rule):
+    """By either kind of rule, to the end, on another trajectory and with another net."""
     nets = [jax.tree.map(np.asarray, small_net(seed)) for seed in range(2)]
-    # steps that are too long, so that some are refused
-    config = TuneConfig(
-        rollout=SHORT, iterations=20, beta_q=0.9, beta_r=0.9, patience=50, smallest_step=1e-300
-    )
+    # the footsteps of a short walk are so rough that some steps are refused
+    config = TuneConfig(rollout=SHORT, rule=rule, others=("footstep_feedback", "turn_lead"))
     seen = []
 
     def on_iteration(iteration):
-        seen.append((iteration.iteration, iteration.accepted, sum(work.values())))
+        seen.append((int(iteration.iteration), bool(iteration.accepted), sum(work.values())))
         work.clear()
 
     for name, net in (("straight", nets[0]), ("s", nets[1])):
         command = named_command(name)
         tune(config, ROBOT, nominal(), command, ANCHOR, as_effect(net), on_iteration)
         work.clear()
-    assert [number for number, *_ in seen] == 2 * [*range(21)]
+    assert [number for number, *_ in seen].count(0) == 2
+    assert len(seen) >= 4
     assert seen[0][2] > 0
-    assert [count for *_, count in seen[1:]] == 41 * [0]
-    assert {accepted for _, accepted, _ in seen} == {True, False}
+    assert [count for *_, count in seen[1:]] == (len(seen) - 1) * [0]
+    if rule == "gauss_newton":
+        assert {accepted for _, accepted, _ in seen} == {True, False}
 
 
 @pytest.mark.slow
@@ -87,9 +88,7 @@ linux = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads 
 @linux
 @pytest.mark.slow
 def test_memory_arrays_and_open_files_stay_flat_over_500_iterations():
-    config = TuneConfig(
-        rollout=RolloutConfig(ticks=30), iterations=500, patience=500, smallest_step=1e-300
-    )
+    config = TuneConfig(rollout=RolloutConfig(ticks=30), iterations=500, rule="relative")
     after = {}
 
     def on_iteration(iteration):
@@ -98,7 +97,7 @@ def test_memory_arrays_and_open_files_stay_flat_over_500_iterations():
 
     command = named_command("c")
     found = tune(config, ROBOT, nominal(), command, ANCHOR, last_command, on_iteration)
-    assert len(found.history) == 501
+    assert len(found.iterations) == 501
     print({number: f"{memory / 2**20:.1f} MiB" for number, (memory, _) in after.items()})
     assert after[500][0] <= 1.05 * after[100][0]
     assert after[500][1] == after[100][1]

@@ -10,7 +10,7 @@ import pytest
 import table as study
 import table_plots
 import table_steps
-from pretend import pretend_history, pretend_walk
+from pretend import pretend_tuning, pretend_walk
 from table import Flags
 
 from hector_jax.cli import flags, run_folder, tune
@@ -25,7 +25,7 @@ from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Tuned
 from hector_jax.search.cmaes import Generation, SearchResult
 from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import TuneConfig, Tuning
+from hector_jax.tuning.difftune import TuneConfig
 
 
 def plants(seeds):
@@ -46,7 +46,7 @@ def asked(monkeypatch):
     def side_by_side(setup, start, problems, title, on_iteration):
         told["tunings"].append((setup.config.iterations, *problems))
         for name in problems:
-            yield name, Tuned(Tuning(pretend_history(12), nominal(), expert(), "done"), "")
+            yield name, Tuned(pretend_tuning(12, expert()), "")
 
     def walks_of(setup, jobs, title, engine):
         for job in jobs:
@@ -57,7 +57,7 @@ def asked(monkeypatch):
         raise VideoUnavailable("no film: none here")
 
     def tune_along_walks(bench, name, start, steps, plants):
-        return Tuned(Tuning(pretend_history(3), nominal(), expert(), "done"), "")
+        return Tuned(pretend_tuning(3, expert()), "")
 
     class Net:
         params = None
@@ -85,7 +85,7 @@ def test_the_plants_of_the_verdict_are_asked_for_once_and_after_all_that_tunes(
 
     names = ("straight", "c", "s")
     study.make_table(table(tmp_path, quick=True, trajectories=names), late)
-    assert seen == [[["without", "with"]] * 3]
+    assert seen == [[["without", "with"], ["paper"]] * 3]
 
 
 def table(tmp_path, **changes):
@@ -98,14 +98,14 @@ def test_a_quick_table_leaves_what_it_promises_beside_the_whole_one(tmp_path, as
     out = tmp_path / "out" / "quick"
     assert told == out / "report.md"
     assert tuple(verdicts) == names
-    assert asked["walks"] == 2 * 8 * 4
+    assert asked["walks"] == 2 * 7 * 4
     assert asked["search"].budget < 200
-    assert [rest for _, *rest in asked["tunings"]] == [["without", "with"]] * 2
+    assert asked["tunings"] == [(4, "without", "with"), (10, "paper")] * 2
     text = told.read_text()
     assert "python experiments/table.py --" in text
     assert "--quick" in text
     assert '"seeds": 4' in text  # those that were walked, not those of the whole table
-    assert "16 of 64 walks ended in a fall" in text
+    assert "14 of 56 walks ended in a fall" in text
     for name in ("changes", *names):
         assert f"(pictures/{name}.png)" in text
         assert (out / "pictures" / f"{name}.png").stat().st_size > 10_000
@@ -122,7 +122,7 @@ def test_a_long_search_and_extra_sets_are_rows_and_cost_only_their_own_walks(
     monkeypatch.setattr(study, "draw", lambda *args: [])
     small = {"trajectories": ("s",), "seeds": 2}
     study.make_table(table(tmp_path, **small), plants)
-    assert asked["walks"] == 16
+    assert asked["walks"] == 14
     for folder in ("search_2000", "other"):
         save_weights(tmp_path / folder / "s.json", nominal())
     with pytest.raises(ValueError, match=r"s-card.json: cannot read the card of a search"):
@@ -132,7 +132,7 @@ def test_a_long_search_and_extra_sets_are_rows_and_cost_only_their_own_walks(
     found = table(tmp_path, **small, extra=(f"mine={tmp_path / 'other'}",))
     told, verdicts = study.make_table(found, plants)
     assert list(verdicts["s"].scores) == [*study.SETS, "search_2000", "mine"]
-    assert asked["walks"] == 16 + 4
+    assert asked["walks"] == 14 + 4
     text = told.read_text()
     assert "`with` against `search_2000`" in text
     assert "| s: `search_2000` | 2000 | 1234 | 1.000 | 50 generations |" in text
@@ -145,7 +145,7 @@ def test_a_long_search_and_extra_sets_are_rows_and_cost_only_their_own_walks(
         ({"first_seed": -1}, "--first-seed must be a whole number from 0 to 4294967295, got -1"),
         ({"steps": -1}, "--steps must be a whole number from 0 to 10000, got -1"),
         ({"trajectories": ("turn",)}, "--trajectories must be of straight, c, s, got turn"),
-        ({"iterations": 3}, "--iterations must be a whole number from 10 to 10000, got 3"),
+        ({"iterations": 0}, "--iterations must be a whole number from 1 to 10000, got 0"),
         ({"rollouts": 3}, "--rollouts must be a whole number from 10 to 1000000, got 3"),
         ({"step_plants": 0}, "--step-plants must be a whole number from 1 to 1000, got 0"),
         ({"trajectories": ("moon",)}, "--trajectories must be of straight, c, s, got moon"),
@@ -170,7 +170,7 @@ def test_a_tuning_along_walks_is_stored_for_its_plants_and_steps(tmp_path, monke
 
     def tune_measured(config, start, evaluate, on_iteration):
         made.append(config.iterations)
-        return Tuning(pretend_history(3), nominal(), expert(), "done")
+        return pretend_tuning(3, expert())
 
     monkeypatch.setattr(table_steps, "tune_measured", tune_measured)
     monkeypatch.setattr(table_steps, "function_id", repr)  # `made` would be of the content
@@ -178,8 +178,8 @@ def test_a_tuning_along_walks_is_stored_for_its_plants_and_steps(tmp_path, monke
     for steps, count in ((2, 3), (2, 3), (5, 3), (2, 4)):
         tuned = table_steps.tune_along_walks(bench, "s", nominal(), steps, count)
         assert tuned.commit == "abc"
-        assert len(tuned.tuning.history) == 4
-    assert made == [12, 15, 12]
+        assert len(tuned.tuning.iterations) == 4
+    assert made == [2, 5, 2]
     assert len(list((tmp_path / "s").glob("tuning-walks-*.npz"))) == 3
 
 

@@ -346,7 +346,7 @@ def test_walks_of_models_and_trajectories_with_hyphens_are_told_apart():
 def small(folder):
     """The walks that `hector tune --verdict` adds, and their table."""
     robot = load_robot()
-    sets = {name: nominal() for name in ("nominal", "expert", "without_ten", "best", "with")}
+    sets = {name: nominal() for name in ("nominal", "expert", "without", "best", "with")}
     course = NamedCommand("s", named_command("s"))
     with ThreadPoolExecutor(1) as pool:
         inputs = Setup(pool, tune_config(robot), robot), sets, course

@@ -157,8 +157,8 @@ def test_a_run_that_goes_on_lends_its_newest_weights(tmp_path):
 
 
 def test_an_unknown_set_is_told_those_that_there_are(tmp_path):
-    run = pretend_run(tmp_path, weights=["with_ten"])
-    expected = "no weight set 'witth'; it has expert, nominal, with, with_ten, without"
+    run = pretend_run(tmp_path, weights=["with_walks"])
+    expected = "no weight set 'witth'; it has expert, nominal, with, with_walks, without"
     with pytest.raises(ValueError, match=expected):
         runs.weights_of(run, "witth")
 

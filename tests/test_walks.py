@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 from model import AHEAD, BRIEF
-from pretend import pretend_history
+from pretend import pretend_tuning
 
 from hector_jax.cli import propose, run_folder
 from hector_jax.cli import tune as command
@@ -33,7 +33,7 @@ from hector_jax.sim.engine import ENGINES, MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import TuneConfig, Tuning
+from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import loss_of
 
 # all walks of this file are of these ticks and this command: one set of programs for all tests
@@ -152,8 +152,8 @@ def test_the_plain_model_is_not_grounded(robot, pool, in_process):
         for grounded in (True, False)
     ]
     point = rows[1].point
-    assert losses[0](rows[0].point)[0] == pytest.approx(0.0)
-    assert losses[0](point)[0] != losses[1](point)[0]
+    assert losses[0].evaluate(rows[0].point)[0] == pytest.approx(1.0)
+    assert losses[0].evaluate(point)[0] != losses[1].evaluate(point)[0]
 
 
 def test_the_record_of_another_tuning_is_refused(robot, in_process):
@@ -360,7 +360,7 @@ def test_from_proposal_to_report_by_the_commands(monkeypatch, robot, pool, tmp_p
 
 
 def test_a_run_spends_the_walks_that_were_asked_for(monkeypatch, robot, tmp_path):
-    there = Tuned(Tuning(pretend_history(3), nominal(), expert(), "done"), "")
+    there = Tuned(pretend_tuning(3, expert()), "")
     row = walks.Row(np.zeros(19), "start", None, np.ones(2), 0.1)
     seen = {}
 

@@ -365,7 +365,7 @@ def descend(
         # copies, because a view would keep the device's array for as long as the history
         trial = jax.tree.map(np.array, weights_at(config, state.start, state.steps))
         evaluation, matrix = jax.tree.map(np.array, objective.evaluate(trial)), state.rule.matrix
-        if needs_matrix(config, state, evaluation):
+        if _needs_matrix(static, state, evaluation):
             matrix = objective.matrix(trial)
         state, iteration = _update(static, state, evaluation, matrix)
         history.append(jax.tree.map(np.array, iteration))
@@ -394,3 +394,6 @@ def needs_matrix(config: TuneConfig, state: TuneState, evaluation: Evaluation) -
     if config.rule != "gauss_newton":
         return False
     return trial_status(config, state, evaluation) == StepStatus.ACCEPTED
+
+
+_needs_matrix = jax.jit(needs_matrix, static_argnums=0)

@@ -43,17 +43,10 @@ class StepState(NamedTuple):
 
 
 def _init(steps: Float[Array, " n"]) -> StepState:
-    infinite, zeros = jnp.asarray(jnp.inf), jnp.zeros_like(steps)
-    matrix = jnp.zeros((len(steps), len(steps)))
-    return StepState(
-        jnp.asarray(1.0),
-        steps,
-        infinite,
-        infinite,
-        zeros,
-        matrix,
-        jnp.zeros((), jnp.int32),
-    )
+    # of the later type, or `update` is compiled again
+    one, infinite = (jnp.asarray(x, steps.dtype) for x in (1.0, jnp.inf))
+    zeros, matrix = jnp.zeros_like(steps), jnp.zeros((len(steps), len(steps)), steps.dtype)
+    return StepState(one, steps, infinite, infinite, zeros, matrix, jnp.zeros((), jnp.int32))
 
 
 def _model(ridge: float, state: StepState) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
@@ -100,7 +93,8 @@ def _trusted_step(ridge: float, state: StepState) -> Float[Array, " n"]:
         excess = jnp.sqrt(square) / state.size - 1.0
         return jnp.maximum(damping + excess * square / descent, 0.0)
 
-    damping = jax.lax.fori_loop(0, 40, improve, jnp.zeros_like(state.size))
+    least = jnp.maximum(jnp.linalg.norm(along) / state.size - values[-1], 0.0)
+    damping = jax.lax.fori_loop(0, 40, improve, least)
     return -vectors @ (along / (values + damping))
 
 
