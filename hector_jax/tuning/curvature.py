@@ -158,7 +158,7 @@ def determined(precision: Float[Array, "n n"], ridge: float, names: Sequence[str
         for curvature, vector in zip(curvatures[::-1].tolist(), vectors.T[::-1], strict=True)
         if of_doubling * curvature > _FLAT
     ]
-    smallest = 1e-12 * eigenvalues[-1]
+    smallest = max(1e-12 * eigenvalues[-1], np.finfo(float).tiny)
     variances = np.diag(vectors / np.maximum(eigenvalues, smallest) @ vectors.T)
     shares = np.clip(1.0 - ridge * variances, 0.0, 1.0).tolist()
     return Determined(strongest, len(names), dict(zip(names, shares, strict=True)))

@@ -67,7 +67,7 @@ class TuneConfig:
     others: tuple[str, ...] = ()  # names in `parameters.TUNABLES`, tuned with Q and R
     rule: str = "gauss_newton"  # or the paper's: "relative", "literal" (theta - beta dL/dtheta)
     # of "gauss_newton": share of the loss at the start, for e-folds of |z|^2 = 2
-    ridge: Annotated[float, NOT_NEGATIVE] = 0.01
+    ridge: Annotated[float, NOT_NEGATIVE] = 0.003
     # of the paper's rules: largest relative step of a weight in Q, in R
     beta_q: Annotated[float, POSITIVE] = 0.05
     beta_r: Annotated[float, POSITIVE] = 0.08
@@ -247,9 +247,12 @@ def update(
         matrix: Gauss-Newton matrix at the trial; not used if that is rejected.
     """
     iteration, begun = state.iteration, jnp.isfinite(state.rule.value)
-    status, believed = trial_status(config, state, evaluation), step_status(config, evaluation)
+    status = trial_status(config, state, evaluation)
+    sound = (status != StepStatus.ACCEPTED) | jnp.all(jnp.isfinite(matrix))
+    status = jnp.where(sound, status, StepStatus.NOT_FINITE)
+    usable = (status == StepStatus.ACCEPTED) | (status == StepStatus.NO_GAIN)
+    value = jnp.where(usable, evaluation.loss, jnp.inf)
     rule, trial = step_rule(config, state.start), weights_at(config, state.start, state.steps)
-    value = jnp.where(believed == StepStatus.ACCEPTED, evaluation.loss, jnp.inf)
     _, pull_back = jax.vjp(lambda z: stepped(state.start, z, config.others), state.steps)
     (gradient,) = pull_back(evaluation.gradient)
     given = {"value": value, "matrix": matrix}

@@ -123,11 +123,12 @@ def trust_region(ridge: float) -> optax.GradientTransformationExtraArgs:
         size = jnp.where((ratio > GOOD) & (length > 0.9 * state.size), larger, state.size)
         size = jnp.where(ratio < POOR, length / 4.0, size)
         size = jnp.where(accepted, size, length / 8.0)
-        wrong = finite & ((ratio < POOR) | (ratio > OPTIMISTIC))
-        misses = jnp.where(wrong, state.misses + 1, jnp.where(finite, 0, state.misses))
+        misses = jnp.where((ratio < POOR) | (ratio > OPTIMISTIC), state.misses + 1, 0)
+        # the first steps only find the radius, and a fall predicts nothing
+        counts = finite & jnp.any(state.steps != 0.0)
         kept = _keep(state, accepted, params, value, updates, matrix)
         kept = kept._replace(size=jnp.where(begun, size, state.size))
-        kept = kept._replace(misses=jnp.where(begun, misses, 0).astype(jnp.int32))
+        kept = kept._replace(misses=jnp.where(counts, misses, state.misses))
         return kept.steps + _trusted_step(ridge, kept) - params, kept
 
     return optax.GradientTransformationExtraArgs(_init, update)  # pyright: ignore
