@@ -185,7 +185,8 @@ def test_the_standard_error_of_that_choice_is_one_over_plants(monkeypatch):
         losses, score = {"set 0": np.exp(-excess), "set 1": np.exp(-2 * excess)}, score_like()
         return SimpleNamespace(
             scores={
-                name: [score._replace(losses={"L": x}) for x in L] for name, L in losses.items()
+                name: [score._replace(losses={"L": np.asarray(x)}) for x in L]
+                for name, L in losses.items()
             }
         )
 

@@ -117,7 +117,7 @@ def carded(folder, robot, name, path=None, *, weights=None, number=0, card=None,
     made = walk_log.walk_card(name, command, weights=weights, robot=robot, seconds=SECONDS)
     about = {"walk": made | (card or {})}
     walk = drawn(robot, name, **options)
-    save_tree(path, walk, kind="trajectory", robot=robot, about=about)
+    save_tree(Path(path), walk, kind="trajectory", robot=robot, about=about)
     return path
 
 
@@ -272,7 +272,7 @@ def test_a_card_that_was_edited_is_refused(folder, robot):
 
 def test_a_card_of_no_walk_is_that_of_a_log_without_one(folder, robot, capsys):
     next_walk(folder, ("ahead",))
-    save_tree("log.npz", drawn(robot, "ahead"), kind="trajectory", robot=robot)
+    save_tree(Path("log.npz"), drawn(robot, "ahead"), kind="trajectory", robot=robot)
     report(folder, "log.npz")
     assert result(capsys)["walk"] == 0
 
