@@ -50,7 +50,7 @@ PACKAGES = {  # in this order: title and purpose of each page of the reference
     "control": ("Controller", "Weights, gait, reference, footholds, MPC and legs; pure JAX."),
     "sim": ("Simulation", "The robot in MuJoCo, one walk at a time or in batches."),
     "grfm": ("Ground reaction net", "phi: the map from command to effect, its data and training."),
-    "tuning": ("Tuning", "Rollout, loss and gradient steps, for one problem or for many."),
+    "tuning": ("Tuning", "Rollout, loss and Gauss-Newton steps, for one problem or for many."),
     "search": ("Search", "Tuning by walks on a simulator, without derivatives."),
     "runs": ("Runs", "Steps from data to evaluation, scores, files of a run, export."),
     "report": ("Report", "Tables, pictures, films and pages of a run."),

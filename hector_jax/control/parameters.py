@@ -182,8 +182,8 @@ def stepped(start: Weights, steps: Float[Array, " n"], others: Sequence[str] = (
         others: names of numbers in `start.others`.
 
     >>> start = nominal()._replace(others={"turn_lead": 0.5})
-    >>> stepped(start, np.full(19, 0.1), ["turn_lead"]).others
-    {'turn_lead': 0.7}
+    >>> float(stepped(start, np.full(19, 0.1), ["turn_lead"]).others["turn_lead"])
+    0.7
     """
     boxes, count = [TUNABLES[name] for name in others], len(direction_names(start))
     moved = {

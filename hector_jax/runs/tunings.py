@@ -1,7 +1,7 @@
-"""The step `tune`: gradient tunings in worker processes, each an artefact (cache.py).
+"""The step `tune`: tunings in worker processes or on a GPU, each an artefact (cache.py).
 
-A tuning runs on one core, because a closed loop is one long chain of small operations; several
-tunings run in parallel.
+On a CPU a tuning runs on one core, because a closed loop is one long chain of small operations;
+several tunings run in parallel.
 """
 
 from collections.abc import Callable, Iterator, Mapping
