@@ -114,7 +114,7 @@ def params():
     return small_net()
 
 
-RULES = {"gauss_newton": 3.0, "relative": 2.0}  # by how much a refusal shortens the step
+RULES = {"gauss_newton": 8.0, "relative": 2.0}  # by how much a refusal shortens the step
 REACH = {"gauss_newton": 0.3, "relative": 0.03}  # a full step goes beyond it, some share does not
 
 

@@ -169,11 +169,11 @@ def after(ratio, *, radius=0.5, ridge=0.0, stiffness=1.0):
         (0.61, 2.0, True, 0),
         (0.59, 1.0, True, 0),
         (0.26, 1.0, True, 0),
-        (0.24, 0.5, True, 1),
-        (0.011, 0.5, True, 1),
-        (0.009, 1 / 3, False, 1),
-        (-2.0, 1 / 3, False, 1),
-        (-np.inf, 1 / 3, False, 0),  # a fall says nothing about the model
+        (0.24, 0.25, True, 1),
+        (0.011, 0.25, True, 1),
+        (0.009, 1 / 8, False, 1),
+        (-2.0, 1 / 8, False, 1),
+        (-np.inf, 1 / 8, False, 0),  # a fall says nothing about the model
         (3.9, 2.0, True, 0),
         (4.1, 2.0, True, 1),
     ],
@@ -197,9 +197,15 @@ def test_the_radius_grows_at_the_border_only_and_to_four_at_most():
         assert float(after(1.0, radius=radius, stiffness=0.1)[1].size) == wanted
 
 
+def test_a_wrong_step_inside_the_region_shrinks_it_to_a_part_of_the_step():
+    for ratio, share in ((0.1, 1 / 4), (-1.0, 1 / 8)):
+        _, new, z, _ = after(ratio, radius=0.5, stiffness=100.0)
+        assert float(new.size) == pytest.approx(share * np.linalg.norm(z))
+
+
 def test_after_a_rejection_the_shorter_step_leaves_from_the_accepted_point():
     before, new, _, trial = after(-1.0, radius=0.5)
-    again, _ = begun(0.0, np.array([3.0, -4.0]), np.eye(2), 100.0, 0.5 / 3)
+    again, _ = begun(0.0, np.array([3.0, -4.0]), np.eye(2), 100.0, 0.5 / 8)
     np.testing.assert_allclose(trial, np.asarray(before.steps + again), rtol=1e-9)
     assert float(new.value) == float(before.value)
 

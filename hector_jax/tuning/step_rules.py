@@ -124,8 +124,7 @@ def trust_region(ridge: float) -> optax.GradientTransformationExtraArgs:
         size = jnp.where(ratio < POOR, length / 4.0, size)
         size = jnp.where(accepted, size, length / 8.0)
         misses = jnp.where((ratio < POOR) | (ratio > OPTIMISTIC), state.misses + 1, 0)
-        # the first steps only find the radius, and a fall predicts nothing
-        counts = finite & jnp.any(state.steps != 0.0)
+        counts = begun & finite  # a fall says nothing of the prediction
         kept = _keep(state, accepted, params, value, updates, matrix)
         kept = kept._replace(size=jnp.where(begun, size, state.size))
         kept = kept._replace(misses=jnp.where(counts, misses, state.misses))
