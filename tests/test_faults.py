@@ -247,14 +247,16 @@ def test_no_number_makes_weights_that_are_not_finite(number, rule, where, begin)
         odd = where == "matrix" and looks["all"] >= begin
         return np.full((18, 18), number) if odd else np.eye(18)
 
-    config, huge = replace(CONFIG, rule=rule), not abs(number) < 1e150
-    if huge and where != "matrix" and begin == 1:
+    config, refused = replace(CONFIG, rule=rule), not abs(number) < 1e150
+    if where == "matrix":
+        refused = rule == "gauss_newton" and not np.isfinite(number)
+    if refused and begin == 1:
         with pytest.raises(InputError, match="loss or gradient not finite"):
             descend(config, nominal(), Objective(look, matrix))
         return
     found = descend(config, nominal(), Objective(look, matrix))
     assert all(inside(iteration.weights) for iteration in found.iterations)
     assert inside(found.weights)
-    if huge and where != "matrix":
+    if refused:
         assert not any(iteration.accepted for iteration in found.iterations[2:])
         assert found.iterations[-1].reason == "loss or gradient not finite"
