@@ -482,7 +482,7 @@ def test_the_table_takes_flags_from_a_file_and_the_line_overrides_it(monkeypatch
     "wrong",
     [
         ("--processes", "0"),
-        ("--iterations", "3"),
+        ("--iterations", "0"),
         ("--seeds", "0"),
     ],
 )
