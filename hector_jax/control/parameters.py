@@ -172,7 +172,9 @@ def step_names(like: Weights, others: Iterable[str] = ()) -> tuple[str, ...]:
     return (*direction_names(like), *others)
 
 
-def stepped(start: Weights, steps: Float[Array, " n"], others: Sequence[str] = ()) -> Weights:
+def stepped(
+    start: Weights, steps: Float[Array | np.ndarray, " n"], others: Sequence[str] = ()
+) -> Weights:
     """Return weights after steps from a start.
 
     Args:

@@ -135,7 +135,9 @@ def matrix_of_walk(
     return rows @ columns.T
 
 
-def determined(precision: Float[Array, "n n"], ridge: float, names: Sequence[str]) -> Determined:
+def determined(
+    precision: Float[Array | np.ndarray, "n n"], ridge: float, names: Sequence[str]
+) -> Determined:
     """Find what a tuning knows about its weights.
 
     Args:

@@ -205,7 +205,9 @@ def _mean_over_feet(values: Float[Array, "feet 3"]) -> Float[Array, "feet 3"]:
     return jnp.broadcast_to(values.mean(axis=0), values.shape)
 
 
-def weights_at(config: TuneConfig, start: Weights, steps: Float[Array, " n"]) -> Weights:
+def weights_at(
+    config: TuneConfig, start: Weights, steps: Float[Array | np.ndarray, " n"]
+) -> Weights:
     """Return the weights after steps z from the start of a tuning, in the box."""
     limits = bounds(start.others, start)  # against rounding of the logarithm
     return optax.projections.projection_box(stepped(start, steps, config.others), *limits)
@@ -227,7 +229,9 @@ def trial_status(config: TuneConfig, state: TuneState, evaluation: Evaluation) -
     status = step_status(config, evaluation)
     if config.rule != "gauss_newton":
         return status
-    ratio = step_rules.gain_ratio(config.ridge, state.rule, state.steps, evaluation.loss)
+    ratio = step_rules.gain_ratio(
+        config.ridge, state.rule, state.steps, jnp.asarray(evaluation.loss)
+    )
     little = jnp.isfinite(state.rule.value) & ~(ratio > step_rules.LEAST)
     return jnp.where((status == StepStatus.ACCEPTED) & little, StepStatus.NO_GAIN, status)
 
@@ -236,7 +240,7 @@ def update(
     config: TuneConfig,
     state: TuneState,
     evaluation: Evaluation,
-    matrix: Float[Array, "n n"],
+    matrix: Float[Array | np.ndarray, "n n"],
 ) -> tuple[TuneState, Iteration]:
     """Accept or reject the trial by its evaluation; return the next state and the iteration.
 

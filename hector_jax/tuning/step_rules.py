@@ -85,7 +85,7 @@ def _trusted_step(ridge: float, state: StepState) -> Float[Array, " n"]:
     values = jnp.maximum(values, 1e-9 * values[-1] + jnp.finfo(values.dtype).tiny)
     along = vectors.T @ slope
 
-    def improve(_: int, damping: Float[Array, ""]) -> Float[Array, ""]:
+    def improve(_: Any, damping: Float[Array, ""]) -> Float[Array, ""]:
         """Newton's method on 1 / |s| - 1 / radius, which is nearly linear in the damping."""
         scaled = along / (values + damping)
         square = scaled @ scaled
@@ -113,7 +113,7 @@ def trust_region(ridge: float) -> optax.GradientTransformationExtraArgs:
         params: Float[Array, " n"],
         *,
         value: Float[Array, ""],
-        matrix: Float[Array, "n n"],
+        matrix: Float[Array | np.ndarray, "n n"],
     ) -> tuple[Float[Array, " n"], StepState]:
         begun, finite = jnp.isfinite(state.value), jnp.isfinite(value)
         ratio = gain_ratio(ridge, state, params, value)
