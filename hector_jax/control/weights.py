@@ -96,7 +96,7 @@ def weights_to_vector(weights: Weights) -> Float[Array, "*batch weights"]:
 
 
 def vector_to_weights(
-    vector: Float[Array, "*batch weights"], like: Weights | None = None
+    vector: Float[Array | np.ndarray, "*batch weights"], like: Weights | None = None
 ) -> Weights:
     """Return weights from a vector of `weights_to_vector`, shaped like `like`, default HECTOR's."""
     R = (nominal() if like is None else like).R

@@ -139,7 +139,7 @@ def _keep(
     steps: Float[Array, " n"],
     value: Float[Array, ""],
     gradient: Float[Array, " n"],
-    matrix: Float[Array, "n n"],
+    matrix: Float[Array | np.ndarray, "n n"],
 ) -> StepState:
     """Return the state with a new point, if it was accepted."""
     first = jnp.where(jnp.isfinite(state.first), state.first, value)
