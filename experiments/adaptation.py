@@ -37,7 +37,7 @@ from hector_jax.core.trajectory import Trajectory, Wrench, has_fallen
 from hector_jax.core.tree import stack
 from hector_jax.robot.model import Robot
 from hector_jax.tuning import difftune
-from hector_jax.tuning.difftune import Iteration, TuneConfig, TuneState, weights_at
+from hector_jax.tuning.difftune import Iteration, TuneConfig, TuneState, trial_weights
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.grounded import MeasuredState, carry_from
 from hector_jax.tuning.loss import Loss, losses
@@ -259,8 +259,7 @@ def step_adaptation(
         carry = carry._replace(due=tick + config.late, trace=trace, states=states[-1:], used=())
     weights = carry.weights
     if tick == carry.due:
-        weights = weights_at(config.tune, carry.tuning.start, carry.tuning.steps)
-        weights = jax.tree.map(np.asarray, weights)
+        weights = jax.tree.map(np.asarray, trial_weights(config.tune, carry.tuning))
     return carry._replace(weights=weights, used=(*carry.used, weights)), iteration
 
 

@@ -44,7 +44,7 @@ from hector_jax.runs.setup import Setup
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections, hfs, hfs_varied
 from hector_jax.tuning.batch import Problem, Scenario, tail_weights, tune_batch
-from hector_jax.tuning.difftune import TuneConfig, Tuning, stop_reason
+from hector_jax.tuning.difftune import TuneConfig, Tuning, single
 from hector_jax.tuning.loss import PAPER_LOSS, Terms, with_alphas
 from hector_jax.tuning.rollout import Variation, no_variation
 from hector_jax.tuning.status import Stop
@@ -202,10 +202,10 @@ def final_terms(tunings: Tuning) -> Terms:
     return jax.tree.map(lambda x: x[np.arange(len(last)), last], tunings.history.evaluation.terms)
 
 
-def end_of(flags: Flags, tunings: Tuning, row: int) -> str:
+def end_of(tunings: Tuning, row: int) -> str:
     """Describe why a tuning ended, and when."""
-    reason = stop_reason(TuneConfig(iterations=flags.iterations), Stop(int(tunings.stop[row])))
-    return f"{reason} (after {last_iterations(tunings)[row]})"
+    tuning = single(tunings, row)
+    return f"{tuning.reason} (after {len(tuning.iterations) - 1})"
 
 
 def scores_on(
@@ -294,8 +294,8 @@ def shared(flags: Shared) -> None:
     changes = {n: np.array(list(loss[n].values())) / base for n in list(sets)[1:]}
     make_folder(flags.out)
     caption = plots.ratios(flags.out / "shared.png", list(scores), changes)
-    ends = [f"{n} alone: {end_of(flags, alone, i)}" for i, n in enumerate(names)]
-    ends += [f"{n}: {end_of(flags, together, i)}" for i, n in enumerate(tails)]
+    ends = [f"{n} alone: {end_of(alone, i)}" for i, n in enumerate(names)]
+    ends += [f"{n}: {end_of(together, i)}" for i, n in enumerate(tails)]
     text = [
         "One weight set for several trajectories",
         "Each trajectory's loss is divided by that of its nominal walk before the mean, or the "
@@ -363,7 +363,7 @@ def robust(flags: Robust) -> None:
         f"Judged on {flags.plants} plants drawn around the hfs (hfs-varied).",
         plant_table(scores, "as it is"),
         "\n".join(
-            f"- {n}: {end_of(flags, tunings, i)}"
+            f"- {n}: {end_of(tunings, i)}"
             for n, tunings, i in [("as it is", plain, 0), ("mean", varied, 0), ("CVaR", varied, 1)]
         ),
     ]
@@ -414,7 +414,7 @@ def front(flags: Front) -> None:
         cells, end = ["", ""], ""
         if name in sets:
             i = list(sets).index(name)
-            cells, end = [*map(million, model[i])], end_of(flags, tunings, i)
+            cells, end = [*map(million, model[i])], end_of(tunings, i)
         fell = "yes" if scores[name].fallen.any() else "no"
         rows.append([name, *cells, *map(million, losses), fell, end])
     make_folder(flags.out)

@@ -23,7 +23,7 @@ from hector_jax.report.report import TEMPLATES, Picture, change_text, column, se
 from hector_jax.report.run import tuning_section
 from hector_jax.runs import metrics
 from hector_jax.runs.metrics import BASELINES, Comparison, Summary, Verdict
-from hector_jax.tuning.difftune import TuneConfig, Tuning, stop_reason
+from hector_jax.tuning.difftune import Tuning
 
 PAPER = {
     "straight": {
@@ -220,7 +220,7 @@ def write_table(folder: Path, table: Table) -> Path:
 def _report(table: Table, sets: Summaries) -> str:
     scores = [score for verdict in table.verdicts.values() for score in verdict.scores.values()]
     sections = [
-        tuning_section(f"{trajectory}, {name}", tuning, _stop(tuning), where=_where(name))
+        tuning_section(f"{trajectory}, {name}", tuning, where=_where(name))
         for trajectory, tunings in table.tunings.items()
         for name, tuning in tunings.items()
     ]
@@ -253,12 +253,6 @@ def _where(name: str) -> str:
     """Return where the loss of a tuning was computed, in words."""
     walks = "of its walks on the simulator, mean over their plants"
     return walks if name == "with_walks" else "on the model"
-
-
-def _stop(tuning: Tuning) -> str:
-    """Return why a tuning ended."""
-    done = max(1, len(tuning.iterations) - 1)
-    return stop_reason(TuneConfig(iterations=done), tuning.stop)
 
 
 def _csv(table: Table, sets: Summaries) -> str:
@@ -306,7 +300,7 @@ def _result(table: Table, sets: Summaries) -> dict[str, Any]:
         }
         result["ranking"] = ranking(verdict)
         result["tunings"] = {
-            name: {"iterations": len(tuning.iterations) - 1, "stop": _stop(tuning)}
+            name: {"iterations": len(tuning.iterations) - 1, "stop": tuning.reason}
             for name, tuning in table.tunings.get(trajectory, {}).items()
         }
         kinds = {"search_200": table.searches, "search_2000": table.long_searches}

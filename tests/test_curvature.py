@@ -18,8 +18,8 @@ from hector_jax.tuning.difftune import (
     TuneConfig,
     init,
     model_objective,
+    trial_weights,
     update,
-    weights_at,
 )
 from hector_jax.tuning.evaluate import mean_objective
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
@@ -61,7 +61,7 @@ def objectives():
 def point(objective):
     """Gradient and matrix that a tuning has at Z."""
     state = init(CONFIG, START)._replace(steps=jnp.asarray(Z))
-    at = weights_at(CONFIG, state.start, state.steps)
+    at = trial_weights(CONFIG, state)
     after, _ = update(CONFIG, state, objective.evaluate(at), objective.matrix(at))
     assert float(after.rule.value) > 0.0
     return after.rule

@@ -39,10 +39,9 @@ from hector_jax.tuning.difftune import (
     descend,
     init,
     rejection_reason,
-    stop_reason,
+    trial_weights,
     tune,
     update,
-    weights_at,
 )
 from hector_jax.tuning.evaluate import Evaluation, Objective, aligned, mean_objective
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
@@ -77,7 +76,7 @@ def stepped_once(gradient, config, start=None, others=()):
     """The weights after one step from a start, by `init` and `update`."""
     state = init(config, nominal() if start is None else start)
     after, _ = update(config, state, evaluation(gradient=gradient), state.rule.matrix)
-    return weights_at(config, state.start, after.steps)
+    return trial_weights(config, after)
 
 
 RELATIVE = TuneConfig(rule="relative")
@@ -219,7 +218,7 @@ def test_a_quadratic_is_tuned_to_its_optimum_in_a_few_steps():
 def test_the_papers_ten_steps_are_taken_uphill_too(rule):
     start = vector_to_weights(jnp.asarray(OPTIMUM * 1.01))
     found = tune_toy(quadratic(), TuneConfig(rule=rule), start)
-    assert stop_reason(RELATIVE, found.stop) == "10 iterations"
+    assert found.reason == "10 iterations"
     losses = [float(i.evaluation.loss) for i in found.iterations]
     assert all(i.accepted for i in found.iterations)
     assert len(losses) == 11
@@ -251,7 +250,7 @@ def test_it_stops_where_the_next_step_is_predicted_to_gain_too_little(share, end
     found = tune_toy(quadratic(fixed=gain * (1.0 / (share * LEAST_GAIN) - 1.0)), start=start)
     assert (len(found.iterations) == 1) == ended
     assert Stop(int(found.stop)) == Stop.NO_GAIN
-    assert stop_reason(EXACT, found.stop).endswith("predicted to gain less than 0.5%")
+    assert found.reason.endswith("predicted to gain less than 0.5%")
 
 
 def test_two_wrong_predictions_in_a_row_end_it():
@@ -265,14 +264,14 @@ def test_two_wrong_predictions_in_a_row_end_it():
     found = tune_toy(toy._replace(evaluate=evaluate))
     assert Stop(int(found.stop)) == Stop.ROUGH
     assert [i.accepted for i in found.iterations] == [True, True, True]
-    assert stop_reason(EXACT, found.stop) == "2 steps in a row did not gain what was predicted"
+    assert found.reason == "2 steps in a row did not gain what was predicted"
 
 
 def test_a_limit_ends_it():
     found = tune_toy(quadratic(stiffness=3.0), TuneConfig(iterations=2, ridge=0.0))
     assert [int(i.iteration) for i in found.iterations] == [0, 1, 2]
     assert Stop(int(found.stop)) == Stop.LIMIT
-    assert stop_reason(TuneConfig(iterations=2), found.stop) == "2 iterations"
+    assert found.reason == "2 iterations"
 
 
 def test_a_fall_shortens_the_step_goes_back_is_told_and_is_no_wrong_prediction():

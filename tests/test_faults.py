@@ -26,7 +26,7 @@ from hector_jax.runs.folder import Journal
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Problem
 from hector_jax.tuning import rollout
-from hector_jax.tuning.difftune import TuneConfig, descend, stop_reason
+from hector_jax.tuning.difftune import TuneConfig, descend
 from hector_jax.tuning.evaluate import Evaluation, Objective
 from hector_jax.tuning.rollout import RolloutConfig
 from hector_jax.tuning.status import Stop
@@ -154,7 +154,7 @@ def test_without_a_fault_nothing_is_refused_as_one(params, rule):
     assert len(lines) == len(found.iterations) > 1
     if rule == "relative":
         assert all(line["accepted"] for line in lines)
-        assert stop_reason(CONFIG, found.stop) == "14 iterations"
+        assert found.reason == "14 iterations"
     assert {line["reason"] for line in lines} <= {"", "the loss did not fall as predicted"}
 
 
@@ -176,7 +176,7 @@ def test_a_fault_is_refused_and_shrunk_and_the_run_goes_on(params, fault, rule):
     assert reasons.keys() <= {REASONS[fault], "the loss did not fall as predicted"}
     assert reasons[REASONS[fault]] >= first - 1
     refused = sum(not line["accepted"] for line in lines)
-    section = tuning_section("with", found, "")
+    section = tuning_section("with", found)
     assert f"{len(lines) - 1} iterations, {refused} refused" in section
     assert all(inside(iteration.weights) for iteration in found.iterations)
     assert all(furthest(i.weights) <= reach for i in found.iterations if i.accepted)

@@ -16,7 +16,7 @@ from hector_jax.report.report import Picture, print_table
 from hector_jax.report.run import tuning_section, write_report
 from hector_jax.runs.walks import Change
 from hector_jax.tuning.curvature import Determined, Direction
-from hector_jax.tuning.status import StepStatus
+from hector_jax.tuning.status import StepStatus, Stop
 
 
 def _printed(verdict, **options):
@@ -39,14 +39,13 @@ def _report(verdict=None, film="no film: MuJoCo cannot draw here (egl: no device
     return dict(
         trajectory="straight",
         verdict=verdict or pretend_verdict(),
-        tunings={"without": tuning, "with": tuning},
+        tunings={"without": tuning, "with": tuning._replace(stop=np.array(Stop.SMALL_STEP))},
         norms={"without": {"L_Eul": 12.0, "L_pos": 7.0, "L_ctrl": 8e5}},
         determined=Determined(
             [Direction(0.25, 0.96, {"Q_pitch": 0.9, "Q_x": -0.4})],
             18,
             {"Q_pitch": 0.9, "R_Mz": 0.1},
         ),
-        stops={"without": "10 iterations", "with": "the step became too small to gain"},
         errors=errors,
         pictures=[Picture("loss.png", "Loss by iteration.")],
         film=film,
@@ -166,7 +165,7 @@ def test_the_report_tells_everything_that_was_promised(tmp_path):
         "`Q_roll`",
         "2 (m g)^2",
         "another value may be as good: `R_Mz`.",
-        "ended because: 10 iterations",
+        "ended because: 14 iterations",
         "make tune TRAJ=straight",
         "the paper's footnote".capitalize(),
     ):
@@ -228,7 +227,7 @@ def test_the_report_says_what_was_tuned_beside_the_weights():
     others = {"turn_lead": np.array(2.0), "kp": np.full(5, 60.0)}
     history = pretend_history(12, turn_lead=0.5, kp=others["kp"])
     end = expert()._replace(others=others)
-    text = tuning_section("with", tuning_of(history, end), "12 iterations")
+    text = tuning_section("with", tuning_of(history, end))
     assert "- ended because: 12 iterations" in text
     assert "- L on the model: " in text
     assert "- turn_lead: 0.5 at the start, 2.0 at the end" in text

@@ -42,7 +42,7 @@ from hector_jax.runs.walks import Campaign, Row, candidates, changes, tune_on_wa
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.curvature import Determined, determined
-from hector_jax.tuning.difftune import Tuning, stop_reason
+from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.evaluate import aligned
 from hector_jax.tuning.loss import smoother
 
@@ -89,11 +89,6 @@ class _Run(NamedTuple):
         config = self.setup.config
         loss = smoother(config.loss, self.args.smooth)
         return self.setup._replace(config=replace(config, loss=loss))
-
-    def determined(self, tuning: Tuning) -> Determined:
-        """Return what a tuning knows about its weights."""
-        config = self.setup.config
-        return determined(tuning.precision, config.ridge, step_names(self.start, config.others))
 
     @property
     def artefacts(self) -> Path:
@@ -159,17 +154,18 @@ def _tune_in(folder: Path, args: Tune) -> None:
         walks = _walk_sets(run, tuned.sets)
         case = trajectories[0], run.seconds, run.artefacts / "elsewhere"
         show = small_verdict(run.setup, tuned.sets, *case) if args.verdict else None
-    result, by_name = _result(run, tuned, walks)
+    names = step_names(start, config.others)
+    known = determined(tuned.tunings["with"].precision, config.ridge, names)
+    result, by_name = _result(run, tuned, walks, known)
     write_json(folder / VERSIONS, made_with | {"seconds": f"{time.monotonic() - start_time:.0f}"})
     report = write_report(
         folder,
         trajectory=run.name,
         verdict=by_name[run.name],
         norms=norms,
-        determined=run.determined(tuned.tunings["with"]),
+        determined=known,
         errors=run.net.errors,
         tunings=tuned.tunings,
-        stops={name: stop_reason(config, t.stop) for name, t in tuned.tunings.items()},
         proposals=changes(tuned.proposals),
         best_proposal=tuned.best_proposal,
         cases=len(tuned.proposals[0].losses) if tuned.proposals else 0,
@@ -295,7 +291,10 @@ def _say_worse(name: str, on_hfs: ScoredWalks) -> None:
 
 
 def _result(
-    run: _Run, tuned: _Tuned, walks: Mapping[str, tuple[ScoredWalks, ScoredWalks]]
+    run: _Run,
+    tuned: _Tuned,
+    walks: Mapping[str, tuple[ScoredWalks, ScoredWalks]],
+    known: Determined,
 ) -> tuple[dict[str, Any], dict[str, metrics.Verdict]]:
     """Write result.json; return its content and the verdicts, of all walks and by trajectory."""
 
@@ -321,9 +320,8 @@ def _result(
     if tuned.choices:
         choices = tuned.choices.items()
         result["chosen"] = {name: {"iteration": c.iteration, "of": c.of} for name, c in choices}
-    found = run.determined(tuned.tunings["with"])
-    directions = [direction._asdict() for direction in found.directions]
-    result["determined"] = {"directions": directions, "weights": found.weights}
+    directions = [direction._asdict() for direction in known.directions]
+    result["determined"] = {"directions": directions, "weights": known.weights}
     write_json(run.folder / RESULT, result)
     return result, by_name
 

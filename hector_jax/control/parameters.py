@@ -179,35 +179,55 @@ def stepped(
 
     Args:
         start: with all feet sharing one R.
-        steps: log-steps in the `weights.directions`, then of each of `others`, numbers, as shares
-            of their boxes.
+        steps: log-steps in the `weights.directions`, then of each of `others`, entry by entry, as
+            shares of their boxes.
         others: names of numbers in `start.others`.
 
     >>> start = nominal()._replace(others={"turn_lead": 0.5})
     >>> float(stepped(start, np.full(19, 0.1), ["turn_lead"]).others["turn_lead"])
     0.7
     """
-    boxes, count = [TUNABLES[name] for name in others], len(direction_names(start))
-    moved = {
-        name: start.others[name] + step * (box.upper - box.lower)
-        for name, step, box in zip(others, steps[count:], boxes, strict=True)
-    }
-    scaled = scale_weights(start, steps[:count])
-    return scaled._replace(others={**start.others, **moved})
+    of_weights, rest = jnp.split(jnp.asarray(steps), [len(direction_names(start))])
+    moved = dict(start.others)
+    for name in others:
+        part, rest = jnp.split(rest, [np.size(moved[name])])
+        moved[name] = moved[name] + part.reshape(np.shape(moved[name])) * _width(name)
+    return scale_weights(start, of_weights)._replace(others=moved)
+
+
+def _width(name: str) -> float:
+    return TUNABLES[name].upper - TUNABLES[name].lower
+
+
+def steps_between(
+    start: Weights, weights: Weights, others: Sequence[str] = ()
+) -> Float[Array, " n"]:
+    """Return the steps from a start to weights: the inverse of `stepped`."""
+    first_foot = directions(start).argmax(axis=1)  # index of each direction's first weight
+    logs = jnp.log(weights_to_vector(weights) / weights_to_vector(start))[first_foot]
+    away = [(weights.others[name] - start.others[name]) / _width(name) for name in others]
+    return jnp.concatenate([logs, *map(jnp.ravel, away)])
 
 
 def step_bounds(
     start: Weights, others: Sequence[str] = ()
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Return the bounds of the steps that stay in the box, see `stepped`."""
-    first_foot = directions(start).argmax(axis=1)  # index of each direction's first weight
+    """Return the lower and upper bounds of the steps that stay in the box, see `stepped`."""
+    lower, upper = (steps_between(start, edge, others) for edge in bounds(others, start))
+    return lower, upper
 
-    def steps_to(edge: Weights) -> Float[Array, " n"]:
-        logs = jnp.log(weights_to_vector(edge) / weights_to_vector(start))[first_foot]
-        widths = [TUNABLES[name].upper - TUNABLES[name].lower for name in others]
-        away = [edge.others[name] - start.others[name] for name in others]
-        shares = [change / width for change, width in zip(away, widths, strict=True)]
-        return jnp.concatenate([logs, jnp.asarray(shares, logs.dtype)])
 
-    lower, upper = bounds(others, start)
-    return steps_to(lower), steps_to(upper)
+def weights_after(
+    start: Weights, steps: Float[Array | np.ndarray, " n"], others: Sequence[str] = ()
+) -> Weights:
+    """Return the weights of `stepped`, clipped to the box against rounding of the logarithm."""
+    limits = bounds(start.others, start)
+    return jax.tree.map(jnp.clip, stepped(start, steps, others), *limits)
+
+
+def gradient_by_steps(
+    weights: Weights, gradient: Weights, others: Sequence[str] = ()
+) -> Float[Array, " n"]:
+    """Return the gradient by the steps of `stepped` from that by the weights."""
+    none = jnp.zeros_like(steps_between(weights, weights, others))
+    return jax.vjp(lambda steps: stepped(weights, steps, others), none)[1](gradient)[0]

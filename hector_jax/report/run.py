@@ -47,7 +47,6 @@ def write_report(folder: Path, **contents: Any) -> Path:
 def tuning_section(
     name: str,
     tuning: Tuning,
-    stop: str,
     chosen: Mapping[str, int] | None = None,
     where: str = "on the model",
 ) -> str:
@@ -56,11 +55,10 @@ def tuning_section(
     Args:
         name: of the set.
         tuning: with its history.
-        stop: why it ended, see `difftune.stop_reason`.
         chosen: the chosen iteration, if it is not the last.
         where: the loss was computed, in words.
     """
-    values = {"name": name, "tuning": tuning, "stop": stop, "chosen": chosen, "where": where}
+    values = {"name": name, "tuning": tuning, "chosen": chosen, "where": where}
     return render("tuning.md.j2", **values, refusals=_refusals, at_bounds=_at_bounds)
 
 

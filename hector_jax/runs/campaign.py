@@ -16,12 +16,18 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.control.controller import WalkConfig
-from hector_jax.control.parameters import TUNABLES, out_of_box
+from hector_jax.control.parameters import (
+    TUNABLES,
+    gradient_by_steps,
+    out_of_box,
+    steps_between,
+    weights_after,
+)
 from hector_jax.control.reference import Command
-from hector_jax.control.weights import Weights, direction_names, directions, weights_to_vector
+from hector_jax.control.weights import Weights, direction_names
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.model import Robot
-from hector_jax.search.cmaes import log_bounds, project
+from hector_jax.search.cmaes import checked_bounds
 from hector_jax.search.few_walks import METHODS, Space
 from hector_jax.sim.engine import MUJOCO_C, Engine
 from hector_jax.sim.world import Imperfections
@@ -96,12 +102,7 @@ def with_leg_numbers(walk: WalkConfig, start: Weights, names: Sequence[str]) -> 
 
 def box_of(campaign: Campaign) -> Float[np.ndarray, "n 2"]:
     """Return bounds of the steps: of log-weights, and of other numbers in units of `_unit`."""
-    bounds = [log_bounds(campaign.start)]
-    for name in campaign.numbers:
-        limits = np.array([TUNABLES[name].lower, TUNABLES[name].upper])
-        start = np.reshape(campaign.start.others[name], (-1, 1))
-        bounds.append((limits - start) / np.reshape(_unit(campaign, name), (-1, 1)))
-    return np.concatenate(bounds)
+    return checked_bounds(campaign.start, campaign.numbers) / _units(campaign)[:, None]
 
 
 def _unit(campaign: Campaign, name: str) -> Any:
@@ -111,49 +112,40 @@ def _unit(campaign: Campaign, name: str) -> Any:
     return 0.1 * (TUNABLES[name].upper - TUNABLES[name].lower)
 
 
+def _units(campaign: Campaign) -> Float[np.ndarray, " n"]:
+    """Return the units of all steps, in those of `parameters.stepped`."""
+    widths = {name: TUNABLES[name].upper - TUNABLES[name].lower for name in campaign.numbers}
+    others = [
+        np.broadcast_to(_unit(campaign, name) / width, np.shape(campaign.start.others[name]))
+        for name, width in widths.items()
+    ]
+    return np.concatenate([np.ones(len(direction_names(campaign.start))), *map(np.ravel, others)])
+
+
 def weights_at(campaign: Campaign, space: Space, point: Float[np.ndarray, " n"]) -> Weights:
     """Return the weights of a point."""
-    others = dict(campaign.start.others)
-    sizes = [len(direction_names(campaign.start)), *(np.size(others[n]) for n in campaign.numbers)]
-    of_weights, *steps = np.split(space.to_steps @ point, np.cumsum(sizes)[:-1])
-    for name, step in zip(campaign.numbers, steps, strict=True):
-        tunable, start = TUNABLES[name], others[name]
-        value = start + step.reshape(np.shape(start)) * _unit(campaign, name)
-        others[name] = np.clip(value, tunable.lower, tunable.upper)
-    return project(campaign.start, of_weights)._replace(others=others)
+    steps = _units(campaign) * (space.to_steps @ point)
+    return jax.device_get(weights_after(campaign.start, steps, campaign.numbers))
 
 
 def point_of(campaign: Campaign, space: Space, weights: Weights) -> Float[np.ndarray, " n"]:
     """Return the point of weights: the inverse of `weights_at` in the box."""
-    before, after = (np.asarray(weights_to_vector(w)) for w in (campaign.start, weights))
-    first_foot = directions(campaign.start).argmax(axis=1)  # index of each direction's first weight
-    steps = [np.log(after / before)[first_foot]]
-    for name in campaign.numbers:
-        change = weights.others[name] - campaign.start.others[name]
-        steps.append(np.ravel(change / _unit(campaign, name)))
-    return space.to_point @ np.concatenate(steps)
+    steps = np.asarray(steps_between(campaign.start, weights, campaign.numbers))
+    return space.to_point @ (steps / _units(campaign))
 
 
 def slope_of(
     campaign: Campaign, space: Space, weights: Weights, gradient: Weights
 ) -> Float[np.ndarray, " n"]:
     """Return the gradient with respect to the point from that with respect to the weights."""
-    by_log = np.asarray(weights_to_vector(gradient)) * np.asarray(weights_to_vector(weights))
-    others = [
-        float(gradient.others[name]) * _unit(campaign, name) for name in campaign.config.others
-    ]
-    of_model = np.append(directions(weights) @ by_log, others)
-    # the model's loss does not depend on the numbers of the legs, which come last
-    return space.to_steps.T @ np.pad(of_model, (0, len(space.box) - len(of_model)))
+    by_steps = gradient_by_steps(weights, gradient, campaign.numbers)
+    return space.to_steps.T @ (_units(campaign) * np.asarray(by_steps))
 
 
 def matrix_of(
     campaign: Campaign, space: Space, matrix: Float[np.ndarray, "m m"]
 ) -> Float[np.ndarray, "n n"]:
     """Return a matrix by the point from that by the steps of a tuning, `parameters.stepped`."""
-    others = campaign.config.others
-    widths = [_unit(campaign, n) / (TUNABLES[n].upper - TUNABLES[n].lower) for n in others]
-    units = np.append(np.ones(len(matrix) - len(others)), widths)
     # the model's loss does not depend on the numbers of the legs, which come last
-    steps = units[:, None] * space.to_steps[: len(matrix)]
+    steps = (_units(campaign)[:, None] * space.to_steps)[: len(matrix)]
     return steps.T @ matrix @ steps

@@ -268,12 +268,14 @@ def _model(pool: Executor, campaign: Campaign, space: Space, rows: Sequence[Row]
     def of_cases(job: Callable[..., Any], weights: Weights) -> list[Any]:
         return list(pool.map(job, repeat(campaign), repeat(weights), commands, groundings))
 
-    model_losses = np.array([case.loss for case in of_cases(_evaluate_job, weights)])
+    at_best = of_cases(_evaluate_job, weights)
+    model_losses = np.array([case.loss for case in at_best])
     scales = rows[best].losses / rows[0].losses / model_losses / len(commands)
 
     def evaluate(point: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
         weights = weights_at(campaign, space, point)
-        cases = of_cases(_evaluate_job, weights)
+        walked = np.array_equal(point, rows[best].point)
+        cases = at_best if walked else of_cases(_evaluate_job, weights)
         if any(step_status(campaign.config, case) != StepStatus.ACCEPTED for case in cases):
             return np.inf, np.zeros_like(point)
         slopes = [slope_of(campaign, space, weights, case.gradient) for case in cases]

@@ -22,14 +22,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.control.parameters import Q, R, bounds
-from hector_jax.control.weights import (
-    Weights,
-    direction_names,
-    directions,
-    scale_weights,
-    weights_to_vector,
-)
+from hector_jax.control.parameters import Q, R, bounds, step_bounds, weights_after
+from hector_jax.control.weights import Weights, direction_names, weights_to_vector
 from hector_jax.control.weights_file import weights_tree
 from hector_jax.core.files import append_file, as_json, write_file
 from hector_jax.core.inputs import InputError, require_package
@@ -129,7 +123,8 @@ def search(
         # an interruption may have left one journal a generation behind another
         number = min(len(search.history) for search in active.values())
         steps = {name: s.ask() for name, s in active.items() if len(s.history) == number}
-        losses = walk({n: [project(starts[n], step) for step in s] for n, s in steps.items()})
+        sets = {n: [weights_after(starts[n], step) for step in s] for n, s in steps.items()}
+        losses = walk(jax.device_get(sets))
         for name in steps:
             generation = to_generation(steps[name], losses[name])
             add_row(paths[name], {k: v.tolist() for k, v in generation._asdict().items()})
@@ -161,7 +156,7 @@ class CmaSearch:
         self.optimizer = CMA(
             mean=np.zeros(len(direction_names(start))),
             sigma=config.spread,
-            bounds=log_bounds(start),
+            bounds=checked_bounds(start),
             seed=config.seed,
             population_size=config.population,
         )
@@ -191,7 +186,8 @@ class CmaSearch:
     def result(self) -> SearchResult:
         """Return the best weights so far."""
         steps, loss, number = best(self.history)
-        return SearchResult(project(self.start, steps), loss, number, self.history, self.stop)
+        weights = jax.device_get(weights_after(self.start, steps))
+        return SearchResult(weights, loss, number, self.history, self.stop)
 
     def parse(self, row: Mapping[str, Any]) -> Generation:
         """Return the generation of a row of the journal; ValueError if its size is wrong."""
@@ -211,19 +207,12 @@ def to_generation(steps: Any, losses: Any) -> Generation:
     return Generation(np.array(steps, float), np.where(np.isfinite(numbers), numbers, np.inf))
 
 
-def project(start: Weights, steps: Float[np.ndarray, " directions"]) -> Weights:
-    """Return the weights after steps, clipped to the box against rounding of the logarithm."""
-    scaled = jax.device_get(scale_weights(start, steps))
-    return jax.tree.map(np.clip, scaled, *bounds(start.others, start))
-
-
-def log_bounds(start: Weights) -> Float[np.ndarray, "directions 2"]:
-    """Return the lower and upper bounds of the steps from a start in the box.
+def checked_bounds(start: Weights, others: Sequence[str] = ()) -> Float[np.ndarray, "n 2"]:
+    """Return the `step_bounds` from a start in the box, as two columns.
 
     Raises:
         InputError: the start lies outside the box, or its feet differ.
     """
-    first = directions(start).argmax(axis=1)  # index of the first foot's weight
     trees = (start, *bounds(like=start))
     at, low, high = (np.asarray(weights_to_vector(w), float) for w in trees)
     if any(np.any(part != part[:1]) for part in start.R):
@@ -233,7 +222,7 @@ def log_bounds(start: Weights) -> Float[np.ndarray, "directions 2"]:
             f"{part.path.rpartition('.')[2]} {part.lower:g} to {part.upper:g}" for part in (Q, R)
         )
         raise InputError(f"the start lies outside the box of weights: {box}")
-    return np.log(np.stack([low, high], axis=1) / at[:, None])[first]
+    return np.stack(step_bounds(start, others), axis=1)
 
 
 def read_journal(

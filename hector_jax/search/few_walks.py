@@ -204,8 +204,8 @@ def _descend_in(
     point = center
     for step in range(_STEPS + 1):
         loss, gradient = model.evaluate(point)
-        good = step < _STEPS and np.isfinite(loss)
-        matrix = model.matrix(point) if good else np.zeros((len(point), len(point)))
+        used = step < _STEPS and loss < state.value  # else the rule leaves the point again
+        matrix = model.matrix(point) if used else np.zeros((len(point), len(point)))
         given = {"value": jnp.asarray(loss), "matrix": jnp.asarray(matrix)}
         away = jnp.asarray(point - center)
         updates, state = rule.update(jnp.asarray(gradient), state, away, **given)

@@ -121,7 +121,7 @@ def _evaluate(
 ) -> tuple[Evaluation, Float[Array, "n n"]]:
     """Evaluate all scenarios of a problem as one; also return the matrix, where it is needed."""
     single = all(len(leaf) == 1 for leaf in jax.tree.leaves(effects))
-    weights = difftune.weights_at(config, state.start, state.steps)
+    weights = difftune.trial_weights(config, state)
 
     def over_scenarios(function: Callable[..., Any]) -> Any:
         def of_scenario(scenario: Scenario) -> Any:

@@ -28,11 +28,11 @@ from jaxtyping import Float, Int
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.parameters import (
     TUNABLES,
-    bounds,
+    gradient_by_steps,
     out_of_box,
     step_bounds,
     step_names,
-    stepped,
+    weights_after,
 )
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, directions, nominal, weights_to_vector
@@ -158,6 +158,18 @@ class Tuning(NamedTuple):
         count = len(self.history.iteration)
         return [jax.tree.map(lambda x, i=i: np.asarray(x[i]), self.history) for i in range(count)]
 
+    @property
+    def reason(self) -> str:
+        """Why a single tuning ended."""
+        return {
+            Stop.GOING: "not ended",
+            Stop.LIMIT: plural(len(self.history.iteration) - 1, "iteration"),
+            Stop.SMALL_STEP: "the step became too small to gain",
+            Stop.NO_GAIN: f"the next step was predicted to gain less than {LEAST_GAIN:.1%}",
+            Stop.ROUGH: f"{MISSES} steps in a row did not gain what was predicted",
+            Stop.BAD_START: "the starting weights were refused",
+        }[Stop(int(self.stop))]
+
 
 def tune_step(
     config: TuneConfig,
@@ -205,12 +217,9 @@ def _mean_over_feet(values: Float[Array, "feet 3"]) -> Float[Array, "feet 3"]:
     return jnp.broadcast_to(values.mean(axis=0), values.shape)
 
 
-def weights_at(
-    config: TuneConfig, start: Weights, steps: Float[Array | np.ndarray, " n"]
-) -> Weights:
-    """Return the weights after steps z from the start of a tuning, in the box."""
-    limits = bounds(start.others, start)  # against rounding of the logarithm
-    return optax.projections.projection_box(stepped(start, steps, config.others), *limits)
+def trial_weights(config: TuneConfig, state: TuneState) -> Weights:
+    """Return the weights that are to be evaluated next."""
+    return weights_after(state.start, state.steps, config.others)
 
 
 def step_status(config: TuneConfig, evaluation: Evaluation) -> Int[Array, ""]:
@@ -247,7 +256,7 @@ def update(
     Args:
         config: the settings.
         state: from `init` or the iteration before.
-        evaluation: of the trial, `weights_at(config, state.start, state.steps)`.
+        evaluation: of the trial, `trial_weights(config, state)`.
         matrix: Gauss-Newton matrix at the trial; not used if that is rejected.
     """
     iteration, begun = state.iteration, jnp.isfinite(state.rule.value)
@@ -256,9 +265,8 @@ def update(
     status = jnp.where(sound, status, StepStatus.NOT_FINITE)
     usable = (status == StepStatus.ACCEPTED) | (status == StepStatus.NO_GAIN)
     value = jnp.where(usable, evaluation.loss, jnp.inf)
-    rule, trial = step_rule(config, state.start), weights_at(config, state.start, state.steps)
-    _, pull_back = jax.vjp(lambda z: stepped(state.start, z, config.others), state.steps)
-    (gradient,) = pull_back(evaluation.gradient)
+    rule, trial = step_rule(config, state.start), trial_weights(config, state)
+    gradient = gradient_by_steps(trial, evaluation.gradient, config.others)
     given = {"value": value, "matrix": matrix}
     updates, after = rule.update(gradient, state.rule, state.steps, **given)
     after = cast(StepState, after)
@@ -286,7 +294,7 @@ _update = jax.jit(update, static_argnums=0)
 def result(config: TuneConfig, state: TuneState, history: Iteration) -> Tuning:
     """Return the result of a tuning from its last state and its iterations."""
     rule = state.rule
-    weights = weights_at(config, state.start, rule.steps)
+    weights = weights_after(state.start, rule.steps, config.others)
     precision = rule.matrix / rule.first + config.ridge * jnp.eye(len(rule.steps))
     return Tuning(weights, rule.value, precision, state.stop, history)
 
@@ -294,18 +302,6 @@ def result(config: TuneConfig, state: TuneState, history: Iteration) -> Tuning:
 def rejection_reason(config: TuneConfig, evaluation: Evaluation) -> str:
     """Return why an evaluation is rejected; empty if it is not."""
     return status_text(StepStatus(int(step_status(config, evaluation))), evaluation)
-
-
-def stop_reason(config: TuneConfig, stop: Int[Any, ""] | Stop) -> str:
-    """Describe why a tuning ended."""
-    return {
-        Stop.GOING: "not ended",
-        Stop.LIMIT: plural(config.iterations, "iteration"),
-        Stop.SMALL_STEP: "the step became too small to gain",
-        Stop.NO_GAIN: f"the next step was predicted to gain less than {LEAST_GAIN:.1%}",
-        Stop.ROUGH: f"{MISSES} steps in a row did not gain what was predicted",
-        Stop.BAD_START: "the starting weights were refused",
-    }[Stop(int(stop))]
 
 
 def tune(
@@ -370,7 +366,7 @@ def descend(
     state, static = init(config, weights), replace(config, loss=PAPER_LOSS)  # one program for all
     while state.stop == Stop.GOING:
         # copies, because a view would keep the device's array for as long as the history
-        trial = jax.tree.map(np.array, weights_at(config, state.start, state.steps))
+        trial = jax.tree.map(np.array, trial_weights(config, state))
         evaluation, matrix = jax.tree.map(np.array, objective.evaluate(trial)), state.rule.matrix
         if _needs_matrix(static, state, evaluation):
             matrix = objective.matrix(trial)
