@@ -138,14 +138,21 @@ def slope_of(
     campaign: Campaign, space: Space, weights: Weights, gradient: Weights
 ) -> Float[np.ndarray, " n"]:
     """Return the gradient with respect to the point from that with respect to the weights."""
-    by_steps = gradient_by_steps(weights, gradient, campaign.numbers)
-    return space.to_steps.T @ (_units(campaign) * np.asarray(by_steps))
+    by_steps = np.asarray(gradient_by_steps(weights, gradient, campaign.config.others))
+    return _model_steps(campaign, space, len(by_steps)).T @ by_steps
 
 
 def matrix_of(
     campaign: Campaign, space: Space, matrix: Float[np.ndarray, "m m"]
 ) -> Float[np.ndarray, "n n"]:
     """Return a matrix by the point from that by the steps of a tuning, `parameters.stepped`."""
-    # the model's loss does not depend on the numbers of the legs, which come last
-    steps = (_units(campaign)[:, None] * space.to_steps)[: len(matrix)]
+    steps = _model_steps(campaign, space, len(matrix))
     return steps.T @ matrix @ steps
+
+
+def _model_steps(campaign: Campaign, space: Space, count: int) -> Float[np.ndarray, "m n"]:
+    """Return the derivative by the point of the steps that the model's loss depends on.
+
+    These are the first ones: it does not depend on the numbers of the legs, which come last.
+    """
+    return (_units(campaign)[:, None] * space.to_steps)[:count]

@@ -229,7 +229,8 @@ def gauss_newton_job(
 ) -> Float[np.ndarray, "n n"]:
     """Return the Gauss-Newton matrix divided by the loss, mean over the commands, in a worker."""
     losses = _losses_job(config, robot, start, problem)
-    return _objective(config, robot, start, problem).matrix(start) / losses.mean()
+    matrix = _objective(config, robot, start, problem).matrix(start)
+    return np.asarray(matrix) / losses.mean()
 
 
 def tune_config(robot: Robot, **settings: Any) -> TuneConfig:
