@@ -33,9 +33,9 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import all_devices, setup_jax, workers
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, Range, check
 from hector_jax.core.tree import stack
+from hector_jax.grfm import nets
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect, load_net
-from hector_jax.grfm.residual import member_params
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import verdicts
@@ -204,7 +204,7 @@ def final_terms(tunings: Tuning) -> Terms:
 
 def end_of(tunings: Tuning, row: int) -> str:
     """Describe why a tuning ended, and when."""
-    tuning = single(tunings, row)
+    tuning = single(jax.tree.map(lambda x: x[row], tunings))
     return f"{tuning.reason} (after {len(tuning.iterations) - 1})"
 
 
@@ -324,6 +324,14 @@ def draw_variations(count: int, noise: bool) -> list[Variation]:
         )
         for seed in range(count)
     ]
+
+
+def member_params(params: Any) -> Any:
+    """Return each member of the ensemble as an ensemble of one, stacked on a new first axis."""
+    members = jax.tree.map(lambda p: jnp.asarray(p)[:, None], nets.by_kind(params))
+    count = len(jax.tree.leaves(members)[0])
+    shared = jax.tree.map(lambda p: jnp.broadcast_to(p, (count, *jnp.shape(p))), params)
+    return nets.with_nets(shared, members)
 
 
 def robust(flags: Robust) -> None:

@@ -22,7 +22,7 @@ from hector_jax.report.report import markdown_table
 from hector_jax.robot.description import HECTOR, PlantSizes
 from hector_jax.runs.metrics import Interval, Score, bootstrap, falls_comparable
 from hector_jax.sim.changes import TRUNK_TOP, Change
-from hector_jax.sim.world import NO_PUSH, Push, push_along
+from hector_jax.sim.world import NO_PUSH, Push
 
 DIRECTIONS = 45 * np.arange(8)  # [deg] of the pushes, from ahead to the left
 PUSH_START, PUSH_TIME, PUSH_WALK = 0.8, 0.1, 2.5  # [s] the walk includes the recovery
@@ -104,7 +104,9 @@ def make_scenes(
     start, end = SLIPPERY
 
     def pushed(force: float, side: float, t: float) -> Scene:
-        return Scene(command, PUSH_WALK, push_along(side, force, PUSH_START + t, PUSH_TIME))
+        vector = force * np.array([np.cos(side), np.sin(side), 0.0])
+        times = np.array([PUSH_START + t]), np.array([PUSH_TIME])
+        return Scene(command, PUSH_WALK, Push(vector[None], *times))
 
     def changed(change: Change) -> Scene:
         return Scene(command, changes=(change,))

@@ -61,9 +61,10 @@ from hector_jax.runs.tunings import Problem
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import TuneConfig, rejection_reason, tune_step
+from hector_jax.tuning.difftune import TuneConfig, step_status, tune_step
 from hector_jax.tuning.loss import PAPER_LOSS, loss_of
 from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.status import StepStatus
 
 PUBLISHED = {"nominal": nominal, "expert": expert}
 SETS = (*PUBLISHED, "tuned")
@@ -237,7 +238,8 @@ def _model_job(
         anchor = standing_anchor(robot, tick)
         evaluation = jax.device_get(tune_step(config, robot, weights, command, anchor, effect))
         row = alignment.as_directions(weights, evaluation.gradient)
-        rows.append(np.where(rejection_reason(config, evaluation), np.nan, row))
+        accepted = step_status(config, evaluation) == StepStatus.ACCEPTED
+        rows.append(np.where(accepted, row, np.nan))
     losses = [
         float(_model_loss(config, robot, weights, command, standing_anchor(robot, tick), effect))
         for weights, command, tick in others

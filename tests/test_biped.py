@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 from hector_jax.cli import main as cli
+from hector_jax.cli.flags import Tune
+from hector_jax.cli.parse import as_table
 from hector_jax.control.controller import WalkConfig, walk_config
 from hector_jax.control.reference import named_command
 from hector_jax.control.trajectories import limits
@@ -29,6 +31,7 @@ from hector_jax.robot.kinematics import foot_jacobians, foot_poses
 from hector_jax.robot.model import compile_model, describe, load_robot
 from hector_jax.runs import folder as runs
 from hector_jax.runs import nets
+from hector_jax.runs.cache import robot_hash
 from hector_jax.runs.export import find_weights
 from hector_jax.runs.nets import CollectConfig
 from hector_jax.runs.tunings import tune_config
@@ -254,11 +257,12 @@ def test_the_same_legs_can_be_expected_to_walk_as_fast_in_any_order_of_their_joi
 def test_a_run_is_exported_and_viewed_with_the_robot_that_it_was_for(strider, tmp_path):
     settings = TuneConfig()
     walk = replace(settings.rollout, walk=walk_config(strider))
-    flags = {"traj": "straight", "data": "data", "robot": str(STRIDER)}
-    write_json(
-        tmp_path / "config.json",
-        {"flags": flags, "tune": asdict(replace(settings, rollout=walk)) | {"loss": {}}},
-    )
+    config = {
+        "flags": as_table(Tune(robot=STRIDER)),
+        "robot": robot_hash(strider),
+        "tune": asdict(replace(settings, rollout=walk)) | {"loss": {}},
+    }
+    write_json(tmp_path / "config.json", config)
     save_weights(tmp_path / "weights" / "with.json", expert(strider))
     weights = tmp_path / "weights" / "with.json"
     assert find_weights(tmp_path, "with") == (weights, walk_config(strider))

@@ -22,7 +22,9 @@ from model import OTHERS
 from oracles import exact_solution
 from scipy.spatial.transform import Rotation
 
+from hector_jax.cli.flags import Tune
 from hector_jax.cli.main import main
+from hector_jax.cli.parse import as_table
 from hector_jax.control.contact import LINE_FRICTION
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.gait import GaitConfig
@@ -35,6 +37,7 @@ from hector_jax.core.trajectory import State, pack_wrench
 from hector_jax.qp import QP, Status
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import export
+from hector_jax.runs.cache import robot_hash
 from hector_jax.runs.export import (
     PLATFORMS,
     SCHEMA,
@@ -294,8 +297,11 @@ TUNED = CONFIG.with_others(
 def save_run(folder):
     """A finished run, as far as export reads it."""
     save_weights(folder / "weights" / "best.json", TUNED)
-    flags = {"traj": "straight", "data": "data"}
-    config = {"flags": flags, "tune": {"rollout": {"walk": asdict(CONFIG)}}}
+    config = {
+        "flags": as_table(Tune()),
+        "robot": robot_hash(load_robot()),
+        "tune": {"rollout": {"walk": asdict(CONFIG)}},
+    }
     (folder / "config.json").write_text(json.dumps(config))
     return folder
 

@@ -358,15 +358,15 @@ def test_nets_are_taken_or_refused_in_one_line(folder, net, data):
 
 @pytest.fixture(scope="module")
 def walks(folder):
-    """A collection of two walks in which nothing moves."""
+    """A collection of one walk in which nothing moves."""
     home = folder / "walks"
-    shape = lambda x: [2, 5][: x.ndim] + list(x.shape[2:])  # noqa: E731
+    shape = lambda x: [1, 5][: x.ndim] + list(x.shape[2:])  # noqa: E731
     like = collection.walks_like(load_robot())
     still = jax.tree.map(
         lambda x: np.zeros([s or n for s, n in zip(x.shape, shape(x), strict=True)]), like
     )
-    save_tree(home / "shard-000.npz", still, kind="walks", robot=ROBOT, about={})
-    card = {"walks": 2, "shards": ["shard-000.npz"], "told": {"controller": "mine"}}
+    save_tree(home / "walk-00000.npz", still, kind="walks", robot=ROBOT, about={})
+    card = {"walks": 1, "settings": {"controller": "mine"}}
     (home / "card.json").write_text(json.dumps(card))
     return {path.name: path.read_bytes() for path in home.iterdir()}
 
@@ -379,7 +379,7 @@ def test_collected_walks_are_taken_or_refused_in_one_line(folder, walks, data):
     for name, content in walks.items():
         (home / name).write_bytes(content)
     if data.draw(st.booleans()):
-        spoilt(data, home / "shard-000.npz")
+        spoilt(data, home / "walk-00000.npz")
     elif data.draw(st.booleans()):
         card = home / "card.json"
         card.write_text(json.dumps(changed(data, json.loads(card.read_text()))))

@@ -16,7 +16,12 @@ from hector_jax.sim.walk import walk
 from hector_jax.sim.world import ideal
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
-from hector_jax.tuning.grounded import evaluate_grounded, fit_grounding, grounded_rollout
+from hector_jax.tuning.grounded import (
+    evaluate_grounded,
+    fit_grounding,
+    grounded_matrix,
+    grounded_rollout,
+)
 from hector_jax.tuning.loss import PAPER_LOSS
 from hector_jax.tuning.rollout import RolloutConfig
 
@@ -128,7 +133,7 @@ def test_a_walk_in_mujoco_gives_a_slope_that_leads_down(robot):
 
 def test_with_the_weights_that_were_walked_a_grounded_rollout_is_the_walk(robot, measured):
     missed = fit_grounding(BRIEF, robot, nominal(), *WALKED, measured)
-    again = jax.jit(grounded_rollout, static_argnums=0)(BRIEF, robot, nominal(), *WALKED, missed)
+    again = jax.jit(grounded_rollout, static_argnums=0)(BRIEF, missed, nominal())
     for found, there in zip(again.state, measured.state, strict=True):
         np.testing.assert_allclose(found, there[1:], atol=1e-12)
     assert not again.fallen.any()
@@ -138,13 +143,21 @@ def test_its_gradient_is_that_along_the_walk_by_forward_recursion(robot, measure
     missed = fit_grounding(BRIEF, robot, nominal(), *WALKED, measured)
     # that one prices the change from the command before its first tick too
     tracking = tuple(t._replace(weight=t.weight * (t.name != "L_ctrl")) for t in PAPER_LOSS)
-    found = evaluate_grounded(BRIEF, robot, nominal(), *WALKED, missed, tracking)
+    found = evaluate_grounded(BRIEF, missed, nominal(), tracking)
     config = TuneConfig(rollout=BRIEF, loss=tracking)
     along, _ = evaluate_walk(config, robot, nominal(), *WALKED, measured)
     gradients = [weights_to_vector(one.gradient) for one in (found, along)]
     np.testing.assert_allclose(*gradients, rtol=1e-7, atol=1e-7 * np.abs(gradients[1]).max())
 
 
+def test_the_matrix_of_a_grounded_rollout_has_a_row_for_each_tuned_number(robot, measured):
+    missed = fit_grounding(BRIEF, robot, nominal(), *WALKED, measured)
+    weights = BRIEF.walk.with_others(nominal(), ["turn_lead"])
+    matrix = grounded_matrix(BRIEF, missed, weights, PAPER_LOSS, ("turn_lead",))
+    assert matrix.shape == (19, 19)
+    assert np.isfinite(matrix).all()
+
+
 def test_a_walk_of_another_length_is_refused(robot, measured):
-    with pytest.raises(ValueError, match="a walk of 4 ticks has 5 samples"):
+    with pytest.raises(ValueError, match="different leading axis sizes"):
         fit_grounding(RolloutConfig(ticks=4), robot, nominal(), *WALKED, measured)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from batch import member_params
 from model import LEARNS_TOUCHDOWNS
 from synthetic import synthetic_walk
 
@@ -25,7 +26,7 @@ from hector_jax.grfm.network import (
     variant_of,
 )
 from hector_jax.grfm.paper import fit_linear, fit_scaling
-from hector_jax.grfm.residual import BOUND, member_params, plain_net
+from hector_jax.grfm.residual import BOUND, plain_net
 from hector_jax.grfm.training import predict
 from hector_jax.robot.model import load_robot
 

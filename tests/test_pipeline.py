@@ -60,7 +60,6 @@ def gather(folder, robot, draw=0, **others):
         lambda jobs: (synthetic_walk(10 * draw + job.seed, 12) for job in jobs),
         robot=robot,
         settings=nets.collection_settings(CollectConfig(), robot) | others,
-        about={},
     )
 
 

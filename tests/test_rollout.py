@@ -20,13 +20,14 @@ from hector_jax.tuning.curvature import gauss_newton_jit
 from hector_jax.tuning.difftune import (
     TuneConfig,
     init,
-    rejection_reason,
+    step_status,
     tune,
     tune_step,
 )
 from hector_jax.tuning.evaluate import evaluate_jit, gradient_norms
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.status import StepStatus
 
 LONG = RolloutConfig(ticks=400)
 STRAIGHT = named_command("straight")
@@ -315,7 +316,7 @@ def test_the_loss_is_that_of_its_parts(robot, anchor):
     found = tune_step(CONFIG, robot, start(), STRAIGHT, anchor, PLAIN)
     expected = 1e5 * found.terms["L_Eul"] + 2e5 * found.terms["L_pos"] + found.terms["L_ctrl"]
     assert found.loss == pytest.approx(float(expected))
-    assert rejection_reason(CONFIG, jax.tree.map(np.asarray, found)) == ""
+    assert step_status(CONFIG, found) == StepStatus.ACCEPTED
 
 
 def test_the_derivatives_by_other_numbers_are_those_of_differences_and_of_the_recursion(

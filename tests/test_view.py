@@ -13,7 +13,9 @@ from browser import CHROMIUM, opened
 from pretend import elsewhere, pretend_history, pretend_walk
 
 from hector_jax.cli import arguments
+from hector_jax.cli.flags import Tune
 from hector_jax.cli.main import main
+from hector_jax.cli.parse import as_table
 from hector_jax.control.weights import expert, nominal, weights_to_vector
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core import inputs
@@ -24,6 +26,7 @@ from hector_jax.report.motion import motion
 from hector_jax.report.view import ViewedWalk, arrows
 from hector_jax.robot.model import compile_model, describe, load_robot
 from hector_jax.runs import folder as runs
+from hector_jax.runs.cache import robot_hash
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +48,8 @@ def viewed(seed=0, **kwargs):
 def pretend_run(folder, iterations=12, weights=()):
     """The folder of a run, as far as a page reads it."""
     loss = {"euler": 1e5, "position": 2e5}
-    flags = {"traj": "straight", "data": str(folder / "data"), "variant": "residual"}
-    write_json(folder / "config.json", {"flags": flags, "tune": {"loss": loss}})
+    flags, body = as_table(Tune(data=folder / "data")), robot_hash(load_robot())
+    write_json(folder / "config.json", {"flags": flags, "robot": body, "tune": {"loss": loss}})
     write_metrics(folder, iterations)
     for name in weights:
         save_weights(folder / "weights" / f"{name}.json", expert())

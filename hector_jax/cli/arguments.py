@@ -85,7 +85,7 @@ def robot_of(run: Path, request: RunRequest) -> Robot:
         InputError: its files have changed since.
     """
     robot = load_robot(request.robot)
-    if request.body not in (None, robot_hash(robot)):
+    if request.body != robot_hash(robot):
         path = robot.description.path
         raise InputError(f"{run} was tuned for another robot: {path} or its MJCF has changed")
     return robot

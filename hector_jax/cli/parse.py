@@ -18,16 +18,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from hector_jax.cli.flags import (
-    COMMANDS,
-    NAMED_WEIGHTS,
-    Propose,
-    Source,
-    Tune,
-    command,
-    named_file,
-    with_given,
-)
+from hector_jax.cli.flags import COMMANDS, NAMED_WEIGHTS, Source, command, named_file, with_given
 from hector_jax.core.inputs import InputError, check_file, did_you_mean, one_line, short_repr
 from hector_jax.core.settings import SEED, convert, from_table, read_json, read_toml, to_table
 
@@ -170,8 +161,8 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
         if name == "config":
             raise InputError(f"{path}: config stands on the line only")
         values[name] = value
-    if kind in (Tune, Propose) and isinstance(values.get("traj"), str):
-        values["traj"] = [values["traj"]]  # older runs were tuned on one trajectory
+    if kind in (COMMANDS["tune"], COMMANDS["propose"]) and isinstance(values.get("traj"), str):
+        values["traj"] = [values["traj"]]  # a word for a list of one
     # a run records all its flags, also those that nobody gave
     return with_given(from_table(str(path), kind, values), () if path.suffix == ".json" else values)
 
@@ -179,10 +170,7 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
 def as_table(flags: Any) -> dict[str, Any]:
     """Return the flags as JSON values, including those from a file; `from_file` reads them."""
     names = [field.name for field in fields(flags) if field.name != "config"]
-    table = {name: to_table(getattr(flags, name)) for name in names}
-    if isinstance(table.get("traj"), list | tuple) and len(table["traj"]) == 1:
-        (table["traj"],) = table["traj"]  # a word, as in older runs
-    return table
+    return {name: to_table(getattr(flags, name)) for name in names}
 
 
 def as_command(program: str, flags: Any) -> str:

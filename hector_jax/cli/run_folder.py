@@ -28,15 +28,7 @@ from hector_jax.sim.engine import choose_engine
 F = TypeVar("F", bound=Flags)
 
 TIME = "%Y%m%d-%H%M%S"  # names a run
-_CODE = (
-    *COLLECTION_CODE,
-    "grfm.training",
-    "sim.standin",
-    "runs.choice",
-    "runs.campaign",
-    "runs.verdicts",
-    "runs.walks",
-)
+_CODE = (*COLLECTION_CODE, "grfm.training", "sim.standin", "runs.choice", "runs.walks")
 # flags of a call, not of the run that it begins or resumes
 _CALL_FLAGS = ("config", "each", "out", "resume", "runs")
 # flags that may change when a run is resumed

@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -46,14 +46,11 @@ from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.evaluate import aligned
 from hector_jax.tuning.loss import smoother
 
-_FOLDERS = ("out", "resume")  # flags that name the run folder
-
 
 def tune(args: Tune) -> None:
     """Tune one weight set for all trajectories, or one for each, in new or resumed runs."""
-    folder_flags = [f"--{name} {getattr(args, name)}" for name in _FOLDERS if getattr(args, name)]
-    if len(folder_flags) > 1:
-        raise InputError(f"{' and '.join(folder_flags)}: only one can be given")
+    if args.out and args.resume:
+        raise InputError(f"--out {args.out} and --resume {args.resume}: only one can be given")
     if args.video:
         check_film(Path("film.mp4"))
     base, robot = args.resume or args.out, load_robot(args.robot)
@@ -123,7 +120,7 @@ class _Tuned(NamedTuple):
 
     tunings: dict[str, Tuning]
     sets: dict[str, Weights]
-    choices: dict[str, choice.Choice]  # empty if the last iterations are used
+    chosen: dict[str, dict[str, int]]  # iteration by set; empty if the last ones are used
     proposals: list[Row]  # of a tuning on walks; empty without
     best_proposal: str  # "set 3", the one that is `best`; empty without
 
@@ -169,25 +166,22 @@ def _tune_in(folder: Path, args: Tune) -> None:
         proposals=changes(tuned.proposals),
         best_proposal=tuned.best_proposal,
         cases=len(tuned.proposals[0].losses) if tuned.proposals else 0,
-        chosen=result.get("chosen", {}),
+        chosen=tuned.chosen,
         smooth=args.smooth,
         **_draw(run, tuned, *walks[trajectories[0].name]),
         config=settings,
         environment=made_with,
         command=as_command("hector tune", run_folder.run_flags(args)),
     )
-    print_text = partial(_print_tables, by_name, args.seeds, show)
+
+    def print_text() -> None:
+        for name, verdict in by_name.items():
+            print_table(verdict, f"{name}, {plural(args.seeds, 'plant')}")
+        if show:
+            show()
+
     print_result(args.json, {"run": str(folder), "traj": run.name, **result}, print_text)
     say(f"the report is {report}")
-
-
-def _print_tables(
-    verdicts: Mapping[str, metrics.Verdict], seeds: int, show: Callable[[], None] | None
-) -> None:
-    for name, verdict in verdicts.items():
-        print_table(verdict, f"{name}, {plural(seeds, 'plant')}")
-    if show:
-        show()
 
 
 def _note_settings(run: _Run) -> dict[str, Any]:
@@ -247,7 +241,8 @@ def _tune_sets(run: _Run) -> _Tuned:
         sets["best"] = stages[best]
     for name, weights in sets.items():
         save_weights(run.folder / "weights" / f"{name}.json", weights)
-    return _Tuned(results, sets, choices, proposals, best)
+    chosen = {name: {"iteration": c.iteration, "of": c.of} for name, c in choices.items()}
+    return _Tuned(results, sets, chosen, proposals, best)
 
 
 def _campaign(run: _Run, start: Weights) -> Campaign:
@@ -317,9 +312,8 @@ def _result(
     if tuned.proposals:
         result["walks"] = [change._asdict() for change in changes(tuned.proposals)]
         result["best_of_walks"] = tuned.best_proposal
-    if tuned.choices:
-        choices = tuned.choices.items()
-        result["chosen"] = {name: {"iteration": c.iteration, "of": c.of} for name, c in choices}
+    if tuned.chosen:
+        result["chosen"] = tuned.chosen
     directions = [direction._asdict() for direction in known.directions]
     result["determined"] = {"directions": directions, "weights": known.weights}
     write_json(run.folder / RESULT, result)

@@ -60,6 +60,11 @@ class Tunable(NamedTuple):
         """True if the rigid-body model does not have it, so that only walks can tune it."""
         return self.path.startswith("legs.")
 
+    @property
+    def width(self) -> float:
+        """Length of its box."""
+        return self.upper - self.lower
+
     def shape(self, robot: Robot | None = None) -> tuple[int, ...]:
         """Return the shape of the entry in a robot's `Weights.others`, HECTOR by default."""
         description = HECTOR if robot is None else robot.description
@@ -191,12 +196,8 @@ def stepped(
     moved = dict(start.others)
     for name in others:
         part, rest = jnp.split(rest, [np.size(moved[name])])
-        moved[name] = moved[name] + part.reshape(np.shape(moved[name])) * _width(name)
+        moved[name] = moved[name] + part.reshape(np.shape(moved[name])) * TUNABLES[name].width
     return scale_weights(start, of_weights)._replace(others=moved)
-
-
-def _width(name: str) -> float:
-    return TUNABLES[name].upper - TUNABLES[name].lower
 
 
 def steps_between(
@@ -205,7 +206,7 @@ def steps_between(
     """Return the steps from a start to weights: the inverse of `stepped`."""
     first_foot = directions(start).argmax(axis=1)  # index of each direction's first weight
     logs = jnp.log(weights_to_vector(weights) / weights_to_vector(start))[first_foot]
-    away = [(weights.others[name] - start.others[name]) / _width(name) for name in others]
+    away = [(weights.others[n] - start.others[n]) / TUNABLES[n].width for n in others]
     return jnp.concatenate([logs, *map(jnp.ravel, away)])
 
 

@@ -150,16 +150,3 @@ def sample_weights(weights: Weights, factor: float, count: int) -> list[Weights]
     """Draw weight sets log-uniformly within a factor of given weights, with a fixed seed."""
     draws = np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(direction_names(weights))))
     return jax.device_get([scale_weights(weights, np.log(factor) * row) for row in draws])
-
-
-def largest_changes(start: Weights, weights: Weights) -> str:
-    """Return the three directions in which weights differ most from a start, as text.
-
-    >>> largest_changes(nominal(), scale_weights(nominal(), 0.5 * np.eye(18)[1]))
-    'Q_pitch 1.6 times, Q_roll 1 times, Q_yaw 1 times'
-    """
-    before, after = (np.asarray(weights_to_vector(w)) for w in (start, weights))
-    first_foot = directions(start).argmax(axis=1)  # index of each direction's first weight
-    logs = np.log(after / before)[first_foot]
-    changes = sorted(zip(direction_names(start), logs, strict=True), key=lambda x: -abs(x[1]))
-    return ", ".join(f"{name} {np.exp(log):.2g} times" for name, log in changes[:3])

@@ -6,7 +6,6 @@ processes) call `setup_jax` once, before the first array.
 
 import gc
 import os
-import pickle
 import resource
 import signal
 import subprocess
@@ -23,7 +22,7 @@ from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.managers import SyncManager
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 from hector_jax.core.inputs import InputError, check_utf8, one_line, outside_packages
 from hector_jax.core.numerics import pin_options
@@ -175,28 +174,16 @@ def _leave_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-class _Messages(NamedTuple):
-    """A queue of pickled messages, because its manager process would load JAX to unpickle them."""
-
-    queue: Any
-
-    def put(self, message: Any) -> None:
-        self.queue.put(pickle.dumps(message))
-
-    def get(self) -> Any:
-        return pickle.loads(self.queue.get())
-
-    def empty(self) -> bool:
-        return self.queue.empty()
-
-
 @contextmanager
 def message_queue() -> Iterator[Any]:
-    """Create a queue that can be passed to jobs in worker processes."""
+    """Create a queue of bytes that can be passed to jobs in worker processes.
+
+    Messages are to be pickled, because its manager process would load JAX to unpickle them.
+    """
     manager = SyncManager(ctx=_Spawn())
     manager.start(_leave_with_parent)
     with manager:
-        yield _Messages(manager.Queue())
+        yield manager.Queue()
 
 
 def start_worker(cores: Any) -> None:
@@ -230,12 +217,7 @@ def workers(processes: int) -> Iterator[ProcessPoolExecutor]:
 
     The caller's script has to be importable (`if __name__ == "__main__"`), because the processes
     are spawned.
-
-    Raises:
-        ValueError: `processes` is less than one.
     """
-    if processes < 1:
-        raise ValueError(f"the number of processes must be at least 1, got {processes}")
     spawn, others = _Spawn(), active_children()
     cores = spawn.SimpleQueue()
     for core in _cores(processes):

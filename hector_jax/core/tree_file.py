@@ -27,6 +27,7 @@ FORMAT = 1
 ROBOT_DIGITS = 9  # of a robot's numbers; rounding on another machine gives the same hash
 OTHER_CODE = "by other code or other versions of jax, jaxlib, mujoco or another package"
 _SHA256 = 64  # hexadecimal digits
+_ENTRIES = {"kind": str, "robot": str | None, "about": dict, "versions": dict}  # of a card
 
 Tree = TypeVar("Tree")
 
@@ -149,24 +150,19 @@ def _read(path: Path, kind: str | None) -> tuple[dict[str, np.ndarray], dict[str
         card = json.loads(str(arrays.pop("card")))
     except Exception as error:  # a malformed archive can raise anything
         raise InputError(f"{path}: no card or no plain arrays inside: {one_line(error)}") from error
-    _check_card(path, card)
-    if kind is not None and card["kind"] != kind:
-        raise InputError(f"{path}: holds {short_repr(card['kind'])[1:-1]}, expected {kind}")
-    return arrays, card
-
-
-def _check_card(path: Path, card: Any) -> None:
     if not isinstance(card, dict):
         raise InputError(f"{path}: card must be an object, got {short_repr(card)}")
     if card.get("format") != FORMAT:
         raise InputError(
             f"{path}: file format {short_repr(card.get('format'))}, this version reads {FORMAT}"
         )
-    kinds = {"kind": str, "robot": str | None, "about": dict, "versions": dict}
-    for name, kind in kinds.items():
+    for name, expected in _ENTRIES.items():
         if name not in card:
             raise InputError(f"{path}: card.{name} is missing")
-        convert(card[name], kind, name=f"{path}: card.{name}")
+        convert(card[name], expected, name=f"{path}: card.{name}")
+    if kind is not None and card["kind"] != kind:
+        raise InputError(f"{path}: holds {short_repr(card['kind'])[1:-1]}, expected {kind}")
+    return arrays, card
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:

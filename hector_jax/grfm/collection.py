@@ -7,7 +7,6 @@ or another label needs no new data.
 
 import hashlib
 import json
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,8 +17,8 @@ import numpy as np
 from hector_jax.control.controller import walk_config
 from hector_jax.core.console import say
 from hector_jax.core.files import write_json
-from hector_jax.core.inputs import InputError, short_repr
-from hector_jax.core.settings import read_json
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import Range, convert, read_json
 from hector_jax.core.trajectory import Trajectory, no_samples
 from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import check_settings, load_tree, read_card, save_tree
@@ -28,6 +27,7 @@ from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.robot.model import Robot
 from hector_jax.sim.loop import Job
 
+_NUMBER = Range(1, 1_000_000)  # of walks
 _UNITS = {
     **dict.fromkeys(("period", "duration", "start"), "s"),
     **dict.fromkeys(("euler", "joints"), "rad"),
@@ -50,7 +50,6 @@ def collect(
     *,
     robot: Robot,
     settings: Mapping[str, Any] | None = None,
-    about: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
     """Walk all jobs and save each walk to a file, resuming what an earlier call left.
@@ -64,7 +63,6 @@ def collect(
             order, from any world. A lazy iterator loses least when it is interrupted.
         robot: the robot; walks of another one are refused.
         settings: JSON values of all that determines the walks; walks of others are refused.
-        about: JSON values for the card, such as the engine.
         progress: called with the number of walks done and of all walks.
 
     Raises:
@@ -79,9 +77,8 @@ def collect(
         "units": _UNITS,
         "frames": "world; wrench of the ground on each foot at its foot point, left feet first",
         "settings": all_settings,
-        **(about or {}),
     }
-    paths = [Path(folder) / f"walk-{i:05d}.npz" for i in range(len(jobs))]
+    paths = _paths(folder, len(jobs))
     files = zip(paths, jobs, strict=True)
     walks = [_load_if_sound(path, stack([job]), robot, all_settings) for path, job in files]
     missing = [i for i, walk in enumerate(walks) if walk is None]
@@ -96,8 +93,11 @@ def collect(
     if done < len(jobs):
         raise ValueError(f"{folder}: {len(jobs)} walks asked for, {done} came")
     falls = sum(bool(np.any(walk.trajectory.fallen)) for walk in walks if walk is not None)
-    card = {"walks": len(jobs), "falls": falls, "shards": [path.name for path in paths], **facts}
-    write_json(Path(folder) / "card.json", card)
+    write_json(Path(folder) / "card.json", {"walks": len(jobs), "falls": falls, **facts})
+
+
+def _paths(folder: Path, walks: int) -> list[Path]:
+    return [Path(folder) / f"walk-{i:05d}.npz" for i in range(walks)]
 
 
 def load_walks(folder: Path, robot: Robot) -> Walks:
@@ -107,8 +107,7 @@ def load_walks(folder: Path, robot: Robot) -> Walks:
         InputError: one line naming folder or file: nothing collected, not finished, damaged, or of
             another robot.
     """
-    names = _read_collection(folder)["shards"]
-    parts = [_load_file(Path(folder) / name, robot) for name in names]
+    parts = [_load_file(path, robot) for path in _read_collection(folder)[0]]
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
@@ -118,28 +117,27 @@ def fingerprint(folder: Path) -> dict[str, Any]:
     Raises:
         InputError: nothing collected, not finished, or no valid card.
     """
-    card = _read_collection(folder)
+    paths, settings = _read_collection(folder)
     digest = hashlib.sha256()
-    for name in card["shards"]:
-        digest.update((Path(folder) / name).read_bytes())
-    return {"content": digest.hexdigest()[:16], **card["settings"]}
+    for path in paths:
+        digest.update(path.read_bytes())
+    return {"content": digest.hexdigest()[:16], **settings}
 
 
-def _read_collection(folder: Path) -> dict[str, Any]:
+def _read_collection(folder: Path) -> tuple[list[Path], dict[str, Any]]:
+    """Return the files of a finished collection, and its settings."""
     path = Path(folder) / "card.json"
     if not path.exists():
         raise InputError(f"{folder}: no finished collection (no card.json); collect first")
     try:
         card = read_json(path, "the card of a collection")
-        shards, settings = card["shards"], dict(card["settings"])
-        if not shards or not all(re.fullmatch(r"walk-\d+\.npz", name) for name in shards):
-            raise ValueError(f"shards are {short_repr(shards)}")
+        walks, settings = convert(card["walks"], int, _NUMBER), dict(card["settings"])
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: no card of a collection; collect again") from error
-    for name in shards:
-        if not (Path(folder) / name).is_file():
-            raise InputError(f"{path}: no file {name} beside it; collect again")
-    return {"shards": shards, "settings": settings}
+    paths = _paths(folder, walks)
+    if missing := next((file.name for file in paths if not file.is_file()), ""):
+        raise InputError(f"{path}: no file {missing} beside it; collect again")
+    return paths, settings
 
 
 def _load_file(path: Path, robot: Robot) -> Walks:

@@ -48,6 +48,7 @@ def draw_jobs(
     if count < 1:
         raise ValueError(f"the number of walks must be at least 1, got {count}")
     centres = nominal(robot), expert(robot)
+    description = HECTOR if robot is None else robot.description
 
     def draw(i: int) -> Job:
         rng = np.random.default_rng([seed, i])
@@ -58,8 +59,11 @@ def draw_jobs(
             path = paths[int(rng.integers(len(paths)))]
             weights = _along(path, rng.uniform(0.0, len(path.Q.euler) - 1))
         else:
-            weights = _draw_weights(rng, centres[centre])
-        return _draw_job(rng, i, command, weights, seconds=seconds, robot=robot)
+            draw_one = lambda w: w * SPREAD ** rng.uniform(-1.0, 1.0, w.shape)  # noqa: E731
+            weights = jax.tree.map(draw_one, centres[centre])
+        plant = hfs_drawn(int(rng.integers(2**31)), description=description)
+        push = _draw_push(rng, seconds, description.plants.push)
+        return Job(weights, command, plant, seconds, seed=i, push=push)
 
     return [draw(i) for i in range(count)]
 
@@ -69,25 +73,6 @@ def _along(path: Weights, position: float) -> Weights:
     index, next_ = int(position), min(int(position) + 1, len(path.Q.euler) - 1)
     first, second = (jax.tree.map(lambda w, i=i: np.asarray(w)[i], path) for i in (index, next_))
     return between(first, second, position - index)
-
-
-def _draw_job(
-    rng: np.random.Generator,
-    i: int,
-    command: Command,
-    weights: Weights,
-    *,
-    seconds: float,
-    robot: Robot | None,
-) -> Job:
-    description = HECTOR if robot is None else robot.description
-    plant = hfs_drawn(int(rng.integers(2**31)), description=description)
-    push = _draw_push(rng, seconds, description.plants.push)
-    return Job(weights, command, plant, seconds, seed=i, push=push)
-
-
-def _draw_weights(rng: np.random.Generator, centre: Weights) -> Weights:
-    return jax.tree.map(lambda w: w * SPREAD ** rng.uniform(-1.0, 1.0, w.shape), centre)
 
 
 def _draw_push(rng: np.random.Generator, seconds: float, scale: float) -> Push:

@@ -186,10 +186,3 @@ def plain_net(gait: GaitConfig, axes: int) -> ResidualParams:
     linear = net.linear._replace(ticks=np.float32(ticks), gates=np.array(GATES, np.float32))
     stats = net.stats._replace(scale=net.stats.scale + 1, reach=np.ones((), np.float32))
     return net._replace(linear=linear, stats=stats)
-
-
-def member_params(params: ResidualParams) -> ResidualParams:
-    """Return each member of the ensemble as an ensemble of one, stacked on a new first axis."""
-    shared = jax.tree.map(lambda p: jnp.broadcast_to(p, (MEMBERS, *jnp.shape(p))), params)
-    members = jax.tree.map(lambda p: jnp.asarray(p)[:, None], nets.by_kind(params))
-    return nets.with_nets(shared, members)

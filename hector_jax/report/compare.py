@@ -50,8 +50,7 @@ def _verdict(run: Run, name: str) -> dict[str, Any]:
     try:
         verdict = run.result["sets"][name]["standin"]
         seeds = len(verdict["seeds"])
-        # files without scenes are from before: they have a seed for each walk
-        counts = {"seeds": seeds, "walks": seeds * len(verdict.get("scenes", [""]))}
+        counts = {"seeds": seeds, "walks": seeds * len(verdict["scenes"])}
         verdict = verdict | counts | {"falls": int(verdict["falls"])}
         _cells(name, verdict)  # raises if the file lacks a printed value
         return verdict

@@ -62,35 +62,32 @@ def _lines(template: str, cells: Cells, differs: Mapping[str, str], family: str)
     names = matrix.sets_of(cells)
     pairs = [(n, b) for n in names for b in BASELINES if b in names and b != n]
     pairs = [(n, b) for n, b in pairs if n not in BASELINES] or pairs[-1:]
-    columns = matrix.columns_of(cells)
-    verdicts = {column: next(v for (c, _), v in cells.items() if c == column) for column in columns}
+    seeds = {column: verdict.seeds for (column, _), verdict in cells.items()}
     changes = {pair: matrix.changes(cells, *pair) for pair in pairs}
     text = render(
         template,
+        matrix=matrix,
+        cells=cells,
         above={
             pair: [cell for cell, c in row.items() if c.counts and c.change["L"].low > 0.0]
             for pair, row in changes.items()
         },
-        agreements=matrix.agreements(cells),
-        cell_text=cell_text,
-        engines=list(dict.fromkeys(column.engine for column in columns)),
-        ENGINES=TITLES,
-        falls={name: matrix.falls(cells, name) for name in names},
-        family=family,
-        coarse=[c for c, verdict in verdicts.items() if FEWEST <= len(verdict.seeds) < _COARSE],
-        few=[c for c, verdict in verdicts.items() if len(verdict.seeds) < FEWEST],
-        differs=differs,
-        LEARNED_FROM=LEARNED_FROM,
-        models=list(dict.fromkeys(column.model for column in columns)),
-        pairs=pairs,
-        seeds={column: seeds_text(verdict.seeds) for column, verdict in verdicts.items()},
-        share_text=share_text,
-        spreads={pair: matrix.spreads(cells, *pair) for pair in pairs},
-        tallies={pair: matrix.tally(cells, *pair) for pair in pairs},
-        title_of=title_of,
         void={pair: [x for x, c in row.items() if not c.counts] for pair, row in changes.items()},
+        names=names,
+        pairs=pairs,
+        seeds=map(seeds_text, seeds.values()),
+        engines=list(dict.fromkeys(column.engine for column in seeds)),
+        models=list(dict.fromkeys(column.model for column in seeds)),
+        coarse=[c for c, drawn in seeds.items() if FEWEST <= len(drawn) < _COARSE],
+        few=[c for c, drawn in seeds.items() if len(drawn) < FEWEST],
+        differs=differs,
+        family=family,
+        cell_text=cell_text,
+        share_text=share_text,
+        title_of=title_of,
+        ENGINES=TITLES,
+        LEARNED_FROM=LEARNED_FROM,
         tuned=[name for name in names if name not in BASELINES],
-        worst={pair: matrix.worst(cells, *pair) for pair in pairs},
     )
     return [line for line in text.splitlines() if line]
 

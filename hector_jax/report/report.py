@@ -20,15 +20,8 @@ from rich.table import Table
 from rich.text import Text
 
 from hector_jax.core.inputs import plural
-from hector_jax.runs.metrics import (
-    BASELINES,
-    FEWEST,
-    Comparison,
-    Summary,
-    Verdict,
-    rms,
-    summarize,
-)
+from hector_jax.runs import metrics
+from hector_jax.runs.metrics import BASELINES, Comparison, Summary, Verdict
 
 # titles of worlds that differ from their names
 WORLDS = {"standin": "hardware stand-in", "standin-even": "hardware stand-in, family even"}
@@ -110,7 +103,7 @@ def columns(verdict: Verdict) -> dict[str, Column]:
 
 def summaries(verdict: Verdict) -> dict[str, Summary]:
     """Summarize all sets of a verdict, each against the baselines."""
-    return {name: summarize(verdict, name) for name in verdict.scores}
+    return {name: metrics.summarize(verdict, name) for name in verdict.scores}
 
 
 def baselines(verdict: Verdict) -> list[str]:
@@ -130,7 +123,7 @@ def legend(verdict: Verdict) -> list[str]:
         "legend.txt.j2",
         verdict=verdict,
         seeds=seeds_text(verdict.seeds),
-        has_intervals=len(verdict.seeds) >= FEWEST,
+        has_intervals=len(verdict.seeds) >= metrics.FEWEST,
         mark=None if all(comparison.counts for comparison in comparisons) else VOID,
     )
     return text.splitlines()
@@ -198,8 +191,8 @@ TEMPLATES = Environment(
     lstrip_blocks=True,
     keep_trailing_newline=True,
 )
-_FUNCTIONS = (baselines, change_text, columns, legend, markdown_table, plural, rms, summaries)
-TEMPLATES.globals |= {function.__name__: function for function in (*_FUNCTIONS, wins_text)}
+_FUNCTIONS = (baselines, change_text, columns, legend, markdown_table, plural, summaries, wins_text)
+TEMPLATES.globals |= {function.__name__: function for function in (*_FUNCTIONS, metrics.rms)}
 TEMPLATES.globals["BASELINES"] = BASELINES
 TEMPLATES.filters |= {
     "degrees": math.degrees,

@@ -63,8 +63,6 @@ def load_or_make(
     kind: str,
     robot: Robot,
     about: Mapping[str, Any] | None = None,
-    pack: Callable[[Tree], Any] = lambda tree: tree,
-    unpack: Callable[[Any], Tree] = lambda stored: stored,
 ) -> dict[Key, Tree]:
     """Return artefacts by key: read those on disk, make the others and save them as they come.
 
@@ -76,7 +74,6 @@ def load_or_make(
         kind: kind of the files.
         robot: robot of the artefacts.
         about: JSON values for the cards.
-        pack, unpack: convert an artefact to the tree in its file, and back.
 
     Raises:
         InputError: the folder cannot be written.
@@ -88,12 +85,11 @@ def load_or_make(
         for key, path in paths.items():
             try:
                 if path.exists():
-                    stored, _ = load_tree(path, like(key), kind=kind, robot=robot)
-                    trees[key] = unpack(stored)
+                    trees[key], _ = load_tree(path, like(key), kind=kind, robot=robot)
             except InputError as error:
                 say(f"made anew: {error}")
         missing = [key for key in paths if key not in trees]
         for key, tree in make(missing, dict(trees)) if missing else ():
-            save_tree(paths[key], pack(tree), kind=kind, robot=robot, about=about)
+            save_tree(paths[key], tree, kind=kind, robot=robot, about=about)
             trees[key] = tree
     return {key: trees[key] for key in paths}

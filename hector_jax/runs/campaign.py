@@ -15,14 +15,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from hector_jax.control import parameters
 from hector_jax.control.controller import WalkConfig
-from hector_jax.control.parameters import (
-    TUNABLES,
-    gradient_by_steps,
-    out_of_box,
-    steps_between,
-    weights_after,
-)
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights, direction_names
 from hector_jax.core.inputs import InputError
@@ -95,7 +89,7 @@ def with_leg_numbers(walk: WalkConfig, start: Weights, names: Sequence[str]) -> 
     """
     start = walk.with_others(start, names)
     for name in names:
-        if reason := out_of_box(name, start.others[name]):
+        if reason := parameters.out_of_box(name, start.others[name]):
             raise InputError(f"--tune: {reason}")
     return start
 
@@ -107,30 +101,28 @@ def box_of(campaign: Campaign) -> Float[np.ndarray, "n 2"]:
 
 def _unit(campaign: Campaign, name: str) -> Any:
     """Return the unit steps of a number: a tenth of its range, of joint gains half of the start."""
-    if TUNABLES[name].each_joint:
-        return 0.5 * campaign.start.others[name]
-    return 0.1 * (TUNABLES[name].upper - TUNABLES[name].lower)
+    tunable = parameters.TUNABLES[name]
+    return 0.5 * campaign.start.others[name] if tunable.each_joint else 0.1 * tunable.width
 
 
 def _units(campaign: Campaign) -> Float[np.ndarray, " n"]:
     """Return the units of all steps, in those of `parameters.stepped`."""
-    widths = {name: TUNABLES[name].upper - TUNABLES[name].lower for name in campaign.numbers}
-    others = [
-        np.broadcast_to(_unit(campaign, name) / width, np.shape(campaign.start.others[name]))
-        for name, width in widths.items()
-    ]
-    return np.concatenate([np.ones(len(direction_names(campaign.start))), *map(np.ravel, others)])
+    units = [np.ones(len(direction_names(campaign.start)))]
+    for name in campaign.numbers:
+        unit = _unit(campaign, name) / parameters.TUNABLES[name].width
+        units.append(np.broadcast_to(unit, np.shape(campaign.start.others[name])).ravel())
+    return np.concatenate(units)
 
 
 def weights_at(campaign: Campaign, space: Space, point: Float[np.ndarray, " n"]) -> Weights:
     """Return the weights of a point."""
     steps = _units(campaign) * (space.to_steps @ point)
-    return jax.device_get(weights_after(campaign.start, steps, campaign.numbers))
+    return jax.device_get(parameters.weights_after(campaign.start, steps, campaign.numbers))
 
 
 def point_of(campaign: Campaign, space: Space, weights: Weights) -> Float[np.ndarray, " n"]:
     """Return the point of weights: the inverse of `weights_at` in the box."""
-    steps = np.asarray(steps_between(campaign.start, weights, campaign.numbers))
+    steps = np.asarray(parameters.steps_between(campaign.start, weights, campaign.numbers))
     return space.to_point @ (steps / _units(campaign))
 
 
@@ -138,7 +130,7 @@ def slope_of(
     campaign: Campaign, space: Space, weights: Weights, gradient: Weights
 ) -> Float[np.ndarray, " n"]:
     """Return the gradient with respect to the point from that with respect to the weights."""
-    by_steps = np.asarray(gradient_by_steps(weights, gradient, campaign.config.others))
+    by_steps = np.asarray(parameters.gradient_by_steps(weights, gradient, campaign.config.others))
     return _model_steps(campaign, space, len(by_steps)).T @ by_steps
 
 

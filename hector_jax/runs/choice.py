@@ -126,12 +126,6 @@ def completed(weights: Weights, **others: float) -> Weights:
     return weights._replace(others={**within, **weights.others})
 
 
-def default_limit(setup: Setup) -> float:
-    """Return the limit [m] of the position error: the controller's, else `LIMIT`."""
-    own = setup.config.rollout.walk.mpc.position_limit
-    return round(LIMIT * float(setup.robot.standing_height), 3) if own is None else own
-
-
 def between_tunings(setup: Setup, pair: Sequence[Weights], share: float, limit: float) -> Weights:
     """Return the set between two tunings, with a limit of the position error and other steps.
 
@@ -179,10 +173,12 @@ def answer(
         sets: sets by name: nominal and all tuned sets.
         pair: names of the two tunings.
         share: share of the second tuning.
-        safe: limit of the position error [m], whichever set it is; None: `default_limit` for the
-            set between the tunings.
+        safe: limit of the position error [m], whichever set it is; None: for the set between the
+            tunings that of the controller, else `LIMIT`.
     """
-    limit = default_limit(setup) if safe is None else safe
+    own = setup.config.rollout.walk.mpc.position_limit
+    default = round(LIMIT * float(setup.robot.standing_height), 3) if own is None else own
+    limit = default if safe is None else safe
     mixture = between_tunings(setup, [sets[name] for name in pair], share, limit)
     if safe is not None:
         tuned = {name: w for name, w in sets.items() if name != "nominal"}

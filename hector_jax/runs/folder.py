@@ -30,7 +30,7 @@ from hector_jax.control.weights import (
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.files import append_file, as_json, write_file
 from hector_jax.core.inputs import InputError, read_text, short_repr
-from hector_jax.core.settings import read_json
+from hector_jax.core.settings import convert, read_json
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.difftune import Iteration
 from hector_jax.tuning.evaluate import Evaluation
@@ -65,7 +65,7 @@ class RunRequest(NamedTuple):
     net: Path | None  # file of the net, if it is not in `data`
     variant: str  # of the net
     robot: Path | None  # TOML of the robot; None: HECTOR
-    body: str | None  # `robot_hash` of the robot at the start; None: not in the file
+    body: str  # `robot_hash` of the robot at the start
 
 
 def load_run(folder: Path) -> Run:
@@ -91,16 +91,16 @@ def read_request(folder: Path) -> RunRequest:
         # a run that has just begun has written only its flags
         flags, loss = config["flags"], config.get("tune", {}).get("loss", {})
         return RunRequest(
-            trajectory=str(flags["traj"] if isinstance(flags["traj"], str) else flags["traj"][0]),
+            trajectory=convert(flags["traj"], tuple[str, ...], name="traj")[0],
             loss=with_alphas(loss),
-            smooth=float(flags.get("smooth", 1.0)),
+            smooth=float(flags["smooth"]),
             data=Path(flags["data"]),
-            net=Path(flags["net"]) if flags.get("net") else None,
-            variant=str(flags.get("variant", "residual")),
-            robot=Path(flags["robot"]) if flags.get("robot") else None,
-            body=config.get("robot"),
+            net=flags["net"] and Path(flags["net"]),
+            variant=str(flags["variant"]),
+            robot=flags["robot"] and Path(flags["robot"]),
+            body=config["robot"],
         )
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
+    except (LookupError, TypeError, AttributeError, ValueError) as error:
         raise InputError(
             f"{folder / CONFIG}: expected the settings of a run of `hector tune` ({error!r})"
         ) from None

@@ -1,7 +1,7 @@
 """The steps `collect` and `fit`: collection of walks, and training of nets on them."""
 
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from hector_jax.core.environment import code_hash
 from hector_jax.core.files import locked
 from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError, plural, short_repr
-from hector_jax.core.settings import POSITIVE, SEED, Range, check, from_table
+from hector_jax.core.settings import POSITIVE, SEED, Range, check
 from hector_jax.core.tree_file import check_settings
 from hector_jax.grfm import collection, dataset, network, training
 from hector_jax.grfm.effect import HISTORY, last_command
@@ -64,7 +64,6 @@ class TrainedNet(NamedTuple):
     linear: LinearMap  # the baseline, fitted to the same samples
     errors: dict[str, Any]  # of raw command, linear map and net on held-out walks
     history: History
-    config: TrainConfig
     folder: Path | None  # of the walks; None for a net without walks
     held_out_walks: list[int]  # numbers of the walks that were not trained on
 
@@ -172,7 +171,7 @@ def _train(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Train
         "course": {name: np.asarray(rows).tolist() for name, rows in history._asdict().items()},
     }
     network.save_net(path, params, robot=robot, about=about)
-    return TrainedNet(params, linear, errors, history, config, folder, held_out)
+    return TrainedNet(params, linear, errors, history, folder, held_out)
 
 
 def net_path(data: Path, variant: str) -> Path:
@@ -196,14 +195,12 @@ def load_net(path: Path, robot: Robot, variant: str) -> tuple[TrainedNet, dict[s
         linear = jax.tree.unflatten(structure, map(np.array, about["linear"]))
         held_out = list(about["held_out"])
         settings, made_of = dict(about["settings"]), dict(about["made_of"])
-        trained = {field.name: settings[field.name] for field in fields(TrainConfig)}
-        config = from_table(f"{path}: about.settings", TrainConfig, trained)
         history = History(**{n: np.array(about["course"][n], float) for n in History._fields})
         errors = {name: about["errors"][name] for name in ("raw", "linear", "net")}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: its card does not tell its training: {error!r}") from None
     inputs = {"settings": settings, "made_of": made_of}
-    return TrainedNet(params, linear, errors, history, config, None, held_out), inputs
+    return TrainedNet(params, linear, errors, history, None, held_out), inputs
 
 
 def training_settings(config: TrainConfig, robot: Robot) -> dict[str, Any]:

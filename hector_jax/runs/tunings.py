@@ -4,6 +4,7 @@ On a CPU a tuning runs on one core, because a closed loop is one long chain of s
 several tunings run in parallel.
 """
 
+import pickle
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from functools import partial
@@ -71,7 +72,8 @@ def _tune_job(
 ) -> Tuning:
     """Run one tuning in a worker and put each iteration into the queue `messages`."""
     objective = _objective(config, robot, start, problem)
-    return difftune.descend(config, start, objective, lambda i: messages.put((name, i)))
+    put = lambda iteration: messages.put(pickle.dumps((name, iteration)))  # noqa: E731
+    return difftune.descend(config, start, objective, put)
 
 
 def _tune_on_gpu(setup: Setup, start: Weights, problem: Problem) -> Tuning:
@@ -87,7 +89,7 @@ def _tune_on_gpu(setup: Setup, start: Weights, problem: Problem) -> Tuning:
     ]
     problems = stack([batch.Problem(start, stack(scenarios), np.asarray(1.0))])
     found = batch.tune_batch(config, robot, problems, stack([models[0]["effect"]]))
-    return difftune.single(found, 0)
+    return difftune.single(jax.tree.map(lambda x: x[0], found))
 
 
 def _losses_job(
@@ -146,7 +148,7 @@ def _tunings(
         while running:
             ended = wait(running, timeout=0.1, return_when=FIRST_COMPLETED).done
             while not messages.empty():  # after `wait`: includes all messages of the ended tunings
-                name, iteration = messages.get()
+                name, iteration = pickle.loads(messages.get())
                 done += int(iteration.iteration > 0)
                 remark = f"{name}: L {float(iteration.evaluation.loss) / 1e6:.3f}e6"
                 report_progress(done, total, remark)

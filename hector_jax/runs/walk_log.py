@@ -102,12 +102,6 @@ def _on_samples(log: Log, rows: Any) -> Log:
     return samples._replace(initial=log.initial)
 
 
-@partial(jax.jit, static_argnums=0)
-def _references(tick: float, robot: Robot, command: Command, initial: State, ticks: Any) -> State:
-    anchor = anchor_at(robot, initial, 0)
-    return jax.vmap(lambda t: reference_at(tick, command, anchor, t))(ticks)
-
-
 def walk_card(
     name: str, command: Command, weights: Weights, robot: Robot, seconds: float
 ) -> dict[str, Any]:
@@ -165,10 +159,12 @@ def trajectory_of(log: Log, period: float) -> Trajectory:
     return empty._replace(period=np.asarray(period), **log._asdict())
 
 
-def _reference_of(config: TuneConfig, robot: Robot, command: Command, log: Log) -> State:
-    tick = config.rollout.walk.gait.tick
+@partial(jax.jit, static_argnums=0)
+def _reference_of(tick: float, robot: Robot, command: Command, log: Log) -> State:
+    """Return the reference of a log of 1 ms; `tick` is that of the gait [s]."""
     ticks = (np.arange(len(log.fallen)) + 1.0) / round(tick / TIME_STEP)
-    return _references(tick, robot, command, log.initial, ticks)
+    anchor = anchor_at(robot, log.initial, 0)
+    return jax.vmap(lambda t: reference_at(tick, command, anchor, t))(ticks)
 
 
 def tracking(config: TuneConfig, robot: Robot, command: Command, log: Log) -> dict[str, Any]:
@@ -176,7 +172,8 @@ def tracking(config: TuneConfig, robot: Robot, command: Command, log: Log) -> di
 
     RMS errors and `seconds` are up to a fall, of one sample at least.
     """
-    count, reference = max(np.sum(~log.fallen), 1), _reference_of(config, robot, command, log)
+    count, tick = max(np.sum(~log.fallen), 1), config.rollout.walk.gait.tick
+    reference = _reference_of(tick, robot, command, log)
     euler, position = (
         np.sqrt(np.mean((np.asarray(x) - y)[:count] ** 2, axis=0)).tolist()
         for x, y in zip(log.state[:2], reference[:2], strict=True)
@@ -196,8 +193,8 @@ def evaluate_log(config: TuneConfig, robot: Robot, command: Command, log: Log) -
 
     Source: Eq. 11.
     """
-    stride = round(config.rollout.walk.gait.tick / TIME_STEP)
-    reference = _reference_of(config, robot, command, log)
+    tick = config.rollout.walk.gait.tick
+    stride, reference = round(tick / TIME_STEP), _reference_of(tick, robot, command, log)
     loss = float(loss_of(config.loss, trajectory_of(log, TIME_STEP)._replace(reference=reference)))
     min_height, max_tilt = robot.description.limits
     upright = ~log.fallen

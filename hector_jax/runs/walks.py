@@ -20,11 +20,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from hector_jax.control.parameters import steps_between
 from hector_jax.control.reference import Command
-from hector_jax.control.weights import Weights, largest_changes
+from hector_jax.control.weights import Weights, direction_names
 from hector_jax.control.weights_file import save_weights, weights_tree
 from hector_jax.core.console import bar, say
 from hector_jax.core.environment import code_hash
@@ -42,7 +44,7 @@ from hector_jax.search import few_walks
 from hector_jax.search.cmaes import add_row, read_journal
 from hector_jax.search.few_walks import Model, Proposal, Space, WalkResult
 from hector_jax.sim.loop import Job
-from hector_jax.tuning.difftune import step_status
+from hector_jax.tuning.difftune import TuneConfig, step_status
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.grounded import Grounding, evaluate_grounded, fit_grounding, grounded_matrix
 from hector_jax.tuning.status import StepStatus
@@ -74,34 +76,25 @@ def walk_case(campaign: Campaign, weights: Weights, case: int) -> ScoredLog:
     return evaluate_log(config, robot, command, log)
 
 
-def _rollout_inputs(campaign: Campaign, weights: Weights, command: Command) -> tuple[Any, ...]:
-    """Return the arguments of a rollout on the plain rigid body, which the walks correct."""
-    config = campaign.config.rollout
-    return config, campaign.robot, weights, command, network.effect_of(None, config.walk)
-
-
 def _ground_job(campaign: Campaign, weights: Weights, command: Command, log: Log) -> Grounding:
-    trajectory = trajectory_of(log, campaign.config.rollout.walk.gait.tick)
-    inputs = _rollout_inputs(campaign, weights, command)
-    grounding = jax.device_get(fit_grounding(*inputs, trajectory))
-    if campaign.grounded:
-        return grounding
-    return grounding._replace(residuals=jax.tree.map(np.zeros_like, grounding.residuals))
+    """Ground the plain rigid body on a walk, unless the campaign has no use for residuals."""
+    config, robot = campaign.config.rollout, campaign.robot
+    effect = network.effect_of(None, config.walk)
+    trajectory = trajectory_of(log, config.walk.gait.tick)
+    grounding = fit_grounding(config, robot, weights, command, effect, trajectory)
+    if not campaign.grounded:
+        grounding = grounding._replace(residuals=jax.tree.map(jnp.zeros_like, grounding.residuals))
+    return jax.device_get(grounding)
 
 
-def _evaluate_job(
-    campaign: Campaign, weights: Weights, command: Command, grounding: Grounding
-) -> Evaluation:
-    inputs = _rollout_inputs(campaign, weights, command)
-    return jax.device_get(evaluate_grounded(*inputs, grounding, campaign.config.loss))
+def _evaluate_job(config: TuneConfig, grounding: Grounding, weights: Weights) -> Evaluation:
+    return jax.device_get(evaluate_grounded(config.rollout, grounding, weights, config.loss))
 
 
-def _matrix_job(
-    campaign: Campaign, weights: Weights, command: Command, grounding: Grounding
-) -> Float[np.ndarray, "m m"]:
-    inputs, config = _rollout_inputs(campaign, weights, command), campaign.config
-    found = grounded_matrix(*inputs, grounding, config.loss, others=config.others)
-    return np.asarray(found)
+def _matrix_job(config: TuneConfig, grounding: Grounding, weights: Weights) -> Any:
+    return np.asarray(
+        grounded_matrix(config.rollout, grounding, weights, config.loss, config.others)
+    )
 
 
 def row_of(proposal: Proposal, cases: Sequence[ScoredLog]) -> Row:
@@ -120,8 +113,7 @@ def space_of(pool: Executor, campaign: Campaign) -> Space:
         InputError: the file of the matrix is damaged, or of another robot.
     """
     # reported walks are of the robot's files, however this code reads them: see `walker_hash`
-    robot = None if campaign.reported else campaign.robot
-    path = campaign.folder / "metric.npz"
+    robot, path = None if campaign.reported else campaign.robot, campaign.folder / "metric.npz"
     if not path.exists():
         problem = tunings.Problem(tuple(campaign.commands.values()), None)
         inputs = campaign.config, campaign.robot, campaign.start, problem
@@ -266,7 +258,7 @@ def _model(pool: Executor, campaign: Campaign, space: Space, rows: Sequence[Row]
     groundings = list(pool.map(_ground_job, *inputs))
 
     def of_cases(job: Callable[..., Any], weights: Weights) -> list[Any]:
-        return list(pool.map(job, repeat(campaign), repeat(weights), commands, groundings))
+        return list(pool.map(job, repeat(campaign.config), groundings, repeat(weights)))
 
     at_best = of_cases(_evaluate_job, weights)
     model_losses = np.array([case.loss for case in at_best])
@@ -361,21 +353,20 @@ class Change(NamedTuple):
 
 def changes(rows: Sequence[Row]) -> list[Change]:
     """Return the result of each proposal."""
-    percent = lambda loss: 100.0 * float(np.expm1(loss))  # noqa: E731
-    return [
-        Change(
-            row.method,
-            None if row.predicted is None else percent(row.predicted),
-            percent(row.loss) if np.isfinite(row.loss) else None,
-        )
-        for row in _walked(rows)
-    ]
+
+    def percent(loss: float | None) -> float | None:
+        return None if loss is None or np.isinf(loss) else 100.0 * float(np.expm1(loss))
+
+    return [Change(row.method, *map(percent, (row.predicted, row.loss))) for row in _walked(rows)]
 
 
 def _progress(campaign: Campaign, space: Space, rows: Sequence[Row]) -> str:
     if not rows:
         return "compiling"
     best = few_walks.best_walk(_walked(rows))
-    moved = largest_changes(campaign.start, weights_at(campaign, space, rows[best].point))
-    change = changes(rows)[best].change or 0.0
-    return f"best L {change:+.0f} % against the start" + (f"; {moved}" if best else "")
+    change = f"best L {changes(rows)[best].change or 0.0:+.0f} % against the start"
+    weights = weights_at(campaign, space, rows[best].point)
+    logs = np.asarray(steps_between(campaign.start, weights))
+    moved = sorted(zip(direction_names(weights), logs, strict=True), key=lambda x: -abs(x[1]))[:3]
+    factors = ", ".join(f"{name} {np.exp(log):.2g} times" for name, log in moved)
+    return f"{change}; {factors}" if best else change

@@ -113,10 +113,14 @@ def search(
             **settings,
             "start": np.asarray(weights_to_vector(search.start), float).tolist(),
             "directions": list(direction_names(search.start)),
-            **({"others": weights_tree(search.start)["others"]} if search.start.others else {}),
             **about,
         }
-        search.replay(read_journal(paths[name], head, what="search", parse=search.parse))
+        if search.start.others:
+            head["others"] = weights_tree(search.start)["others"]
+        history = read_journal(paths[name], head, what="search", parse=search.parse)
+        for generation in history[: config.generations]:
+            search.ask()  # repeats the draws of that generation
+            search.tell(generation)
     histories = {name: search.history for name, search in searches.items()}
     on_generation(histories)
     while active := {name: search for name, search in searches.items() if not search.stop}:
@@ -177,12 +181,6 @@ class CmaSearch:
         self.history.append(generation)
         self.optimizer.tell(list(zip(generation.steps, generation.losses.tolist(), strict=True)))
 
-    def replay(self, history: Sequence[Generation]) -> None:
-        """Repeat an earlier history, up to the budget."""
-        for generation in history[: self.config.generations]:
-            self.ask()  # repeats the draws of that generation
-            self.tell(generation)
-
     def result(self) -> SearchResult:
         """Return the best weights so far."""
         steps, loss, number = best(self.history)
@@ -192,12 +190,9 @@ class CmaSearch:
     def parse(self, row: Mapping[str, Any]) -> Generation:
         """Return the generation of a row of the journal; ValueError if its size is wrong."""
         generation, size = to_generation(row["steps"], row["losses"]), self.config.population
-        steps, losses = (x.shape for x in generation)
         expected = (size, len(direction_names(self.start))), (size,)
-        if (steps, losses) != expected:
-            raise ValueError(
-                f"steps {steps} and losses {losses}, expected {expected[0]} and {expected[1]}"
-            )
+        if (got := tuple(x.shape for x in generation)) != expected:
+            raise ValueError("steps {} and losses {}, expected {} and {}".format(*got, *expected))
         return generation
 
 
@@ -218,9 +213,7 @@ def checked_bounds(start: Weights, others: Sequence[str] = ()) -> Float[np.ndarr
     if any(np.any(part != part[:1]) for part in start.R):
         raise InputError("a search needs a start whose feet share one R; these differ")
     if not ((low <= at) & (at <= high)).all():
-        box = ", ".join(
-            f"{part.path.rpartition('.')[2]} {part.lower:g} to {part.upper:g}" for part in (Q, R)
-        )
+        box = ", ".join(f"{n} {x.lower:g} to {x.upper:g}" for n, x in {"Q": Q, "R": R}.items())
         raise InputError(f"the start lies outside the box of weights: {box}")
     return np.stack(step_bounds(start, others), axis=1)
 

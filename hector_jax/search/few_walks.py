@@ -44,7 +44,7 @@ _STALLED = 2  # walks of the model in a row without such a gain before the surro
 _EVERY, _POPULATION, _SPREAD = 4, 8, 0.3  # CMA-ES: period [walks], population, first deviation
 _STEPS = 2  # on the model for a proposal
 _SAME = 0.02  # the model's point counts as walked within this distance of a walk
-_STARTS = 6  # of the maximisation of the expected improvement
+_STARTS, _SQP = 6, 40  # of the maximisation of the expected improvement: starts, iterations
 _ROWS = 16  # histories are padded to multiples of this, so that few programs are compiled
 # means and deviations of the processes' log-normal amplitude, length and noise of one walk
 _PRIOR = np.log([0.3, 3.0, 0.01]), np.array([0.7, 0.7, 0.5])
@@ -221,7 +221,6 @@ def _minimise_in(
     radius: float,
     objective: Callable[..., Any],
     first: Float[np.ndarray, " n"],
-    iterations: int,
 ) -> tuple[Float[np.ndarray, " n"], float]:
     """Minimise in a ball and the box by SQP; returns the best point evaluated and its value."""
     square = lambda x: np.sum((x - center) ** 2)  # noqa: E731
@@ -236,7 +235,7 @@ def _minimise_in(
             feasible.append((float(loss), np.array(x)))
         return float(loss), np.asarray(gradient, float)
 
-    options = {"maxiter": iterations, "ftol": 1e-5}
+    options = {"maxiter": _SQP, "ftol": 1e-5}
     minimize(value, first, jac=True, method="SLSQP", constraints=[ball, box], options=options)
     if not feasible:
         return center, float(objective(center)[0])
@@ -360,7 +359,7 @@ def _improve(
     for start in range(_STARTS):
         offset = rng.standard_normal(len(center)) * 0.7 * radius / np.sqrt(len(center))
         first = center + (offset if start else 0.0)
-        minima.append(_minimise_in(space, center, radius, objective, first, 40))
+        minima.append(_minimise_in(space, center, radius, objective, first))
     point = space.clip(min(minima, key=itemgetter(1))[0])
     mean, _ = _posterior(losses, jnp.asarray(point))
     return Proposal(point, "surrogate", float(mean))

@@ -1,8 +1,8 @@
 """The closed loop of controller and plant, for every physics engine.
 
 A walk starts with double stance under the MPC, then gait cycles in place; at t = 0 the reference is
-anchored at the true centre of mass and yaw. Per tick `plan_tick` solves the MPC, per millisecond
-`motor_torques` turns the plan into torques, the engine steps its physics and reads its contacts,
+anchored at the true centre of mass and yaw. Per tick `step_plan` solves the MPC, per millisecond
+`actuate` turns the plan into torques, the engine steps its physics and reads its contacts,
 and `sample` returns the true state. An engine gives its coordinates as a flat reading
 (`sensing.unpack_reading`); the continuous yaw is passed separately.
 """
@@ -11,11 +11,9 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
-from hector_jax.control.controller import Memory, Plan, WalkConfig, actuate, step_plan
-from hector_jax.control.legs import LegParameters
-from hector_jax.control.parameters import Parameters
+from hector_jax.control.controller import Plan, WalkConfig
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
@@ -26,7 +24,6 @@ from hector_jax.robot.description import Description
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 from hector_jax.sim import sensing
-from hector_jax.sim.actuators import Motors, step_actuators
 from hector_jax.sim.changes import Change
 from hector_jax.sim.sensing import Ground, Touches
 from hector_jax.sim.world import NO_PUSH, Imperfections, Push
@@ -77,78 +74,6 @@ class Sample(NamedTuple):
     joints: Float[Array, "*batch joints"]
     fallen: Bool[Array, "*batch"]
     legs_touch: Bool[Array, "*batch"]
-
-
-def plan_tick(
-    config: WalkConfig,
-    robot: Robot,
-    parameters: Parameters,
-    command: Command,
-    anchor: Anchor,
-    tick: Int[Array, ""],
-    memory: Memory,
-    yaw: Float[Array, ""],
-    reading: Float[Array, " reading"],
-    error: Float[Array, " errors"],
-    *,
-    max_contacts: int,
-) -> tuple[Memory, Plan]:
-    """Measure and solve the MPC, once a tick.
-
-    Args:
-        config, robot, parameters: the controller.
-        command, anchor: command, and where its reference starts.
-        tick: current gait tick.
-        memory: of the controller.
-        yaw: a true yaw [rad] shortly before.
-        reading: current coordinates.
-        error: of the current state estimate.
-        max_contacts: feet that may stand at once, from `contacts_needed` (static).
-    """
-    return step_plan(
-        config,
-        robot,
-        parameters,
-        command=command,
-        anchor=anchor,
-        tick=tick,
-        memory=memory,
-        measurement=sensing.measure(robot, reading, yaw, error)[0],
-        max_contacts=max_contacts,
-    )
-
-
-def motor_torques(
-    config: WalkConfig,
-    robot: Robot,
-    legs: LegParameters,
-    imperfections: Imperfections,
-    memory: Memory,
-    plan: Plan,
-    motors: Motors,
-    yaw: Float[Array, ""],
-    substep: Int[Array, ""],
-    reading: Float[Array, " reading"],
-    error: Float[Array, " errors"],
-) -> tuple[Motors, Float[Array, ""], Float[Array, " joints"]]:
-    """Return motors, true yaw [rad] and the joint torques [N m] over the next millisecond.
-
-    Args:
-        config, robot, legs: the controller.
-        imperfections: of the plant's motors.
-        memory, plan: of the controller.
-        motors: of the millisecond before.
-        yaw: a true yaw [rad] shortly before.
-        substep: milliseconds since the plan.
-        reading: current coordinates.
-        error: of the current state estimate.
-    """
-    measurement, yaw = sensing.measure(robot, reading, yaw, error)
-    torque = actuate(
-        config, robot, legs, plan=plan, memory=memory, substep=substep, measurement=measurement
-    )
-    motors, applied = step_actuators(robot, imperfections, motors, torque)
-    return motors, yaw, applied
 
 
 def effect_of(robot: Robot, before: Float[Array, " reading"], ground: Ground) -> Wrench:

@@ -6,7 +6,7 @@ fallen. The state estimate has no errors. Physics may run in 32 bits with a cont
 cast is at `mjx.step`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from math import ceil
@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from hector_jax.control import controller
 from hector_jax.control.controller import Memory, Plan, WalkConfig, contacts_needed, init_memory
 from hector_jax.control.reference import Anchor, anchor_at, standing_anchor
 from hector_jax.core.arrays import Array
@@ -26,7 +27,7 @@ from hector_jax.core.tree import stack, where
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 from hector_jax.sim import loop, mjx_model, sensing
-from hector_jax.sim.actuators import Motors, init_actuators
+from hector_jax.sim.actuators import Motors, init_actuators, step_actuators
 from hector_jax.sim.loop import Job, Sample, first_tick, substeps
 from hector_jax.sim.mjx_model import mjx
 from hector_jax.sim.sensing import Touches
@@ -128,10 +129,10 @@ def _millisecond(
     robot, job, places = walk.robot, walk.job, program.places
     before = _read(program, walk, carry.physics)
     legs = program.config.parameters(job.weights).legs
-    state = carry.memory, carry.plan, carry.motors, carry.yaw
-    motors, yaw, torque = loop.motor_torques(
-        program.config, robot, legs, job.imperfections, *state, substep, before, walk.error
-    )
+    measurement, yaw = sensing.measure(robot, before, carry.yaw, walk.error)
+    inputs = {"memory": carry.memory, "substep": substep, "measurement": measurement}
+    torque = controller.actuate(program.config, robot, legs, plan=carry.plan, **inputs)
+    motors, torque = step_actuators(robot, job.imperfections, carry.motors, torque)
     force = push_force(job.push, (tick - job.start_tick) * program.substeps + substep)
     physics, data = _step_physics(program, walk, carry.physics, torque=torque, force=force)
     widen = lambda x: x.astype(before.dtype) if x.dtype == data.qpos.dtype else x  # noqa: E731
@@ -167,15 +168,21 @@ def _sample(
     return carry, carry.last._replace(fallen=carry.fallen)
 
 
+def _step_plan(program: _Program, walk: _Walk, max_contacts: int) -> Callable[..., Any]:
+    parameters = program.config.parameters(walk.job.weights)
+    step = partial(
+        controller.step_plan, program.config, walk.robot, parameters, max_contacts=max_contacts
+    )
+    return partial(step, command=walk.job.command)
+
+
 def _plan(
     program: _Program, walk: _Walk, tick: Int[Array, ""], carry: _Carry, *, max_contacts: int
 ) -> tuple[Memory, Plan]:
-    job, reading = walk.job, _read(program, walk, carry.physics)
-    inputs = job.command, carry.anchor, tick, carry.memory, carry.yaw, reading, walk.error
-    parameters = program.config.parameters(job.weights)
-    return loop.plan_tick(
-        program.config, walk.robot, parameters, *inputs, max_contacts=max_contacts
-    )
+    reading = _read(program, walk, carry.physics)
+    measurement, _ = sensing.measure(walk.robot, reading, carry.yaw, walk.error)
+    now = {"anchor": carry.anchor, "tick": tick, "memory": carry.memory}
+    return _step_plan(program, walk, max_contacts)(measurement=measurement, **now)
 
 
 def _tick(
@@ -204,11 +211,10 @@ def _init_carry(program: _Program, walk: _Walk, physics: _Physics) -> _Carry:
     yaw, false, tick = jnp.zeros(()), jnp.zeros((), bool), jnp.asarray(first_tick(config))
     reading, effect = _read(program, walk, physics), zero_wrench(len(robot.foot_point))
     anchor = standing_anchor(robot)._replace(tick=job.start_tick)
-    memory = init_memory(robot, sensing.measure(robot, reading, yaw, walk.error)[0])
-    inputs = anchor, tick, memory, yaw, reading, walk.error
-    parameters = config.parameters(job.weights)
-    plan = partial(loop.plan_tick, config, robot, parameters, job.command, *inputs)
-    shapes = jax.eval_shape(lambda: plan(max_contacts=len(robot.foot_point))[1])
+    measurement, _ = sensing.measure(robot, reading, yaw, walk.error)
+    memory = init_memory(robot, measurement)
+    now = {"anchor": anchor, "tick": tick, "memory": memory, "measurement": measurement}
+    _, shapes = jax.eval_shape(_step_plan(program, walk, len(robot.foot_point)), **now)
     inputs = robot, job.command, anchor, 1.0 * tick, yaw, reading
     sample = loop.sample(config, *inputs, effect=effect, touches=Touches(false, false))
     return _Carry(
@@ -259,13 +265,8 @@ def _walk_all(program, robot, model, qpos, batch):
 
 
 def _check_batch(jobs: Sequence[Job]) -> None:
-    for name, values in (
-        ("seconds", {float(job.seconds) for job in jobs}),
-        ("pieces of the command", {len(job.command.duration) for job in jobs}),
-        ("pushes", {len(job.push.start) for job in jobs}),
-    ):
-        if len(values) > 1:
-            raise ValueError(f"walks of one batch must agree in {name}, got {sorted(values)}")
+    if len(lengths := {float(job.seconds) for job in jobs}) > 1:
+        raise ValueError(f"walks of one batch must agree in seconds, got {sorted(lengths)}")
     if len({job.plant and job.plant.description for job in jobs}) > 1:
         raise ValueError("walks of one batch must be on plants of one model")
     if any(np.any(np.asarray(x)) for job in jobs for x in job.imperfections.estimator):

@@ -19,14 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 
-from hector_jax.control.controller import (
-    Memory,
-    Plan,
-    Retune,
-    WalkConfig,
-    contacts_needed,
-    init_memory,
-)
+from hector_jax.control import controller
+from hector_jax.control.controller import Memory, Plan, Retune, WalkConfig
 from hector_jax.control.parameters import Parameters
 from hector_jax.control.reference import Anchor, anchor_at, standing_anchor, with_pieces
 from hector_jax.control.weights import Weights
@@ -36,7 +30,7 @@ from hector_jax.core.tree import Layout, layout, pack, stack, unpack
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot, quiet_mujoco
 from hector_jax.sim import loop, sensing
-from hector_jax.sim.actuators import init_actuators
+from hector_jax.sim.actuators import init_actuators, step_actuators
 from hector_jax.sim.loop import Job, Sample, first_tick, substeps
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.plant import BuildPlant, Plant
@@ -49,7 +43,7 @@ _measure = jax.jit(sensing.measure)
 @jax.jit
 def _begin(robot: Robot, reading: Array) -> Memory:
     measurement, _ = sensing.measure(robot, reading, jnp.zeros(()), sensing.no_error(robot))
-    return init_memory(robot, measurement)
+    return controller.init_memory(robot, measurement)
 
 
 @jax.jit
@@ -86,9 +80,13 @@ class _Planner:
     ) -> None:
         def plan(*packed: Array) -> Array:
             robot, parameters, command, _ = unpack(constants, packed[0])
-            now = unpack(inputs, packed[1])
-            numbers = config, robot, parameters, command
-            result = loop.plan_tick(*numbers, *now, max_contacts=max_contacts)
+            anchor, tick, memory, yaw, reading, error = unpack(inputs, packed[1])
+            measurement, _ = sensing.measure(robot, reading, yaw, error)
+            now = {"anchor": anchor, "tick": tick, "memory": memory, "measurement": measurement}
+            step = partial(
+                controller.step_plan, config, robot, parameters, max_contacts=max_contacts
+            )
+            result = step(command=command, **now)
             self.layout = layout(result)
             return pack(result)
 
@@ -109,10 +107,12 @@ def _torques(config: WalkConfig, *layouts: Layout) -> Callable[..., Array]:
     """
 
     def torques(*packed: Array) -> Array:
-        constants, tick, (_, yaw, motors), millisecond = map(unpack, layouts, packed)
-        robot, parameters, _, imperfections = constants
-        inputs: Any = robot, parameters.legs, imperfections, *tick, motors, yaw, *millisecond
-        motors, yaw, torque = loop.motor_torques(config, *inputs)
+        constants, (memory, plan), (_, yaw, motors), now = map(unpack, layouts, packed)
+        (robot, parameters, _, imperfections), (substep, reading, error) = constants, now
+        measurement, yaw = sensing.measure(robot, reading, yaw, error)
+        inputs: Any = {"memory": memory, "substep": substep, "measurement": measurement}
+        torque = controller.actuate(config, robot, parameters.legs, plan=plan, **inputs)
+        motors, torque = step_actuators(robot, imperfections, motors, torque)
         return pack((torque, yaw, motors))
 
     def small_call(*packed: Array) -> Array:
@@ -208,7 +208,7 @@ def _walk_blocks(
                 carry, weights = retune.step(carry, tick, anchor, measurement, wrench)
                 packed_constants = _pack((body, _parameters(config, weights), *constants[2:]))
             at_start.append((anchor, np.int32(tick), yaw))
-            planner = planner_for(contacts_needed(config, tick))
+            planner = planner_for(controller.contacts_needed(config, tick))
             inputs = packed_anchor, [tick], np.asarray(packed)[:memory_size], [yaw], rows[step, 1:]
             packed = planner.plan(packed_constants, np.concatenate(inputs))
             plans.append(np.asarray(packed))

@@ -57,18 +57,6 @@ class Push(NamedTuple):
 NO_PUSH = Push(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
 
 
-def push_along(side: float, force: float, start: float, duration: float) -> Push:
-    """Return one level push.
-
-    Args:
-        side: its direction, an angle from ahead to the left [rad].
-        force: its size [N].
-        start, duration: when it starts after t = 0, and how long it lasts [s].
-    """
-    vector = force * np.array([np.cos(side), np.sin(side), 0.0])
-    return Push(*(np.array([x]) for x in (vector, start, duration)))
-
-
 class Imperfections(NamedTuple):
     """Properties of a plant that are unknown to the controller."""
 

@@ -25,15 +25,8 @@ import numpy as np
 import optax
 from jaxtyping import Float, Int
 
+from hector_jax.control import parameters
 from hector_jax.control.controller import WalkConfig
-from hector_jax.control.parameters import (
-    TUNABLES,
-    gradient_by_steps,
-    out_of_box,
-    step_bounds,
-    step_names,
-    weights_after,
-)
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, directions, nominal, weights_to_vector
 from hector_jax.core.arrays import Array
@@ -94,9 +87,9 @@ class TuneConfig:
 
 def _why_not_tunable(walk: WalkConfig, name: str) -> str:
     """Return why gradients of the rigid-body model cannot tune a number; empty if they can."""
-    if name not in TUNABLES:
-        return unknown("tunable", name, TUNABLES)
-    tunable = TUNABLES[name]
+    if name not in parameters.TUNABLES:
+        return unknown("tunable", name, parameters.TUNABLES)
+    tunable = parameters.TUNABLES[name]
     if tunable.of_legs:
         return (
             f"{name} cannot be tuned by gradients: the rigid-body model has no joints, so its "
@@ -109,7 +102,7 @@ def _why_not_tunable(walk: WalkConfig, name: str) -> str:
         )
     if tunable.path.startswith("footstep.") and walk.footstep.rule == "paper":
         return f"{name} has no part in the paper's rule"
-    return out_of_box(name, walk.with_others(nominal(), [name]).others[name])
+    return parameters.out_of_box(name, walk.with_others(nominal(), [name]).others[name])
 
 
 class TuneState(NamedTuple):
@@ -187,7 +180,7 @@ def step_rule(config: TuneConfig, start: Weights) -> optax.GradientTransformatio
     """Return the transformation of the rule of a config; see `step_rules`."""
     if config.rule == "gauss_newton":
         return step_rules.trust_region(config.ridge)
-    names = step_names(start, config.others)
+    names = parameters.step_names(start, config.others)
     blocks = np.array([0 if n.startswith("Q_") else 1 if n.startswith("R_") else 2 for n in names])
     betas = np.array([config.beta_q, config.beta_r, config.beta_others])[blocks]
     if config.rule == "relative":
@@ -204,22 +197,19 @@ def init(config: TuneConfig, weights: Weights) -> TuneState:
     weights = config.rollout.walk.with_others(weights, config.others)
     weights = jax.tree.map(lambda w: jnp.asarray(w, float), weights)
     equal = jnp.all(jnp.stack([jnp.all(w == w[:1]) for w in weights.R]))
-    tied = jax.tree.map(lambda w: jnp.exp(_mean_over_feet(jnp.log(w))), weights.R)
+    mean_over_feet = lambda x: jnp.broadcast_to(x.mean(axis=0), x.shape)  # noqa: E731
+    tied = jax.tree.map(lambda w: jnp.exp(mean_over_feet(jnp.log(w))), weights.R)
     # equal weights stay equal to the last bit
     weights = weights._replace(R=Wrench(*where(equal, weights.R, tied)))
-    zero = jnp.zeros(len(step_names(weights, config.others)))
+    zero = jnp.zeros(len(parameters.step_names(weights, config.others)))
     count = jnp.asarray(0, jnp.int32)
     rule = cast(StepState, step_rule(config, weights).init(zero))
     return TuneState(weights, zero, rule, count, jnp.asarray(Stop.GOING, jnp.int32))
 
 
-def _mean_over_feet(values: Float[Array, "feet 3"]) -> Float[Array, "feet 3"]:
-    return jnp.broadcast_to(values.mean(axis=0), values.shape)
-
-
 def trial_weights(config: TuneConfig, state: TuneState) -> Weights:
     """Return the weights that are to be evaluated next."""
-    return weights_after(state.start, state.steps, config.others)
+    return parameters.weights_after(state.start, state.steps, config.others)
 
 
 def step_status(config: TuneConfig, evaluation: Evaluation) -> Int[Array, ""]:
@@ -266,12 +256,13 @@ def update(
     usable = (status == StepStatus.ACCEPTED) | (status == StepStatus.NO_GAIN)
     value = jnp.where(usable, evaluation.loss, jnp.inf)
     rule, trial = step_rule(config, state.start), trial_weights(config, state)
-    gradient = gradient_by_steps(trial, evaluation.gradient, config.others)
+    gradient = parameters.gradient_by_steps(trial, evaluation.gradient, config.others)
     given = {"value": value, "matrix": matrix}
     updates, after = rule.update(gradient, state.rule, state.steps, **given)
     after = cast(StepState, after)
     steps = optax.apply_updates(state.steps, updates)
-    steps = optax.projections.projection_box(steps, *step_bounds(state.start, config.others))
+    box = parameters.step_bounds(state.start, config.others)
+    steps = optax.projections.projection_box(steps, *box)
 
     stop = jnp.where(iteration >= config.iterations, Stop.LIMIT, Stop.GOING)
     if config.rule == "gauss_newton":
@@ -294,14 +285,9 @@ _update = jax.jit(update, static_argnums=0)
 def result(config: TuneConfig, state: TuneState, history: Iteration) -> Tuning:
     """Return the result of a tuning from its last state and its iterations."""
     rule = state.rule
-    weights = weights_after(state.start, rule.steps, config.others)
+    weights = parameters.weights_after(state.start, rule.steps, config.others)
     precision = rule.matrix / rule.first + config.ridge * jnp.eye(len(rule.steps))
     return Tuning(weights, rule.value, precision, state.stop, history)
-
-
-def rejection_reason(config: TuneConfig, evaluation: Evaluation) -> str:
-    """Return why an evaluation is rejected; empty if it is not."""
-    return status_text(StepStatus(int(step_status(config, evaluation))), evaluation)
 
 
 def tune(
@@ -373,17 +359,16 @@ def descend(
         state, iteration = _update(static, state, evaluation, matrix)
         history.append(jax.tree.map(np.array, iteration))
         on_iteration(history[-1])
-    found = jax.tree.map(lambda x: np.asarray(x)[None], result(config, state, stack(history)))
-    return single(found, 0)
+    return single(result(config, state, stack(history)))
 
 
-def single(tunings: Tuning, row: int) -> Tuning:
-    """Return one tuning of a batch.
+def single(tuning: Tuning) -> Tuning:
+    """Return a tuning, which may be one of a batch, with the iterations up to its end.
 
     Raises:
         InputError: its start was rejected.
     """
-    found = jax.tree.map(lambda x: np.asarray(x)[row], tunings)
+    found = jax.tree.map(np.asarray, tuning)
     count = 1 + int(np.max(found.history.iteration))
     found = found._replace(history=jax.tree.map(lambda x: x[:count], found.history))
     if found.stop == Stop.BAD_START:

@@ -90,10 +90,8 @@ def mean_of(evaluations: Sequence[Evaluation], scales: Float[np.ndarray, " n"]) 
 
 
 def _mean(trees: Sequence[Any], scales: Float[np.ndarray, " n"]) -> Any:
-    def mean(*values: Any) -> Any:
-        return np.mean([value / k for value, k in zip(values, scales, strict=True)], axis=0)
-
-    return jax.tree.map(mean, *trees)
+    scaled = [jax.tree.map(lambda x, k=k: x / k, t) for t, k in zip(trees, scales, strict=True)]
+    return jax.tree.map(lambda *values: np.mean(values, axis=0), *scaled)
 
 
 def mean_objective(
@@ -135,22 +133,23 @@ def gradient_norms(
     return {term.name: norm(term.name) for term in loss}
 
 
-def aligned(loss: Loss, norms: Mapping[str, float], to: str = "") -> Loss:
+def aligned(loss: Loss, norms: Mapping[str, float]) -> Loss:
     """Weigh the terms so that their gradients have the order of that of one (footnote of Eq. 11).
+
+    That one, which keeps its weight, is L_ctrl, or the last if the loss has none.
 
     Args:
         loss: terms and weights.
         norms: of the gradient of each term, see `gradient_norms`.
-        to: the term that keeps its weight; by default L_ctrl, or the last if the loss has none.
 
     Raises:
-        InputError: `to` is no term of the loss, or a term has no norm.
+        InputError: a term has no norm.
     """
     weights = {term.name: term.weight for term in loss}
-    to = to or ("L_ctrl" if "L_ctrl" in weights else loss[-1].name)
-    for name in (to, *weights):
-        if name not in weights or name not in norms:
-            raise InputError(unknown("term of the loss", name, weights.keys() & norms.keys()))
+    to = "L_ctrl" if "L_ctrl" in weights else loss[-1].name
+    for name in weights:
+        if name not in norms:
+            raise InputError(unknown("term of the loss", name, norms))
 
     def weight(norm: float) -> float:
         ratio = norms[to] / max(norm, 1e-12 * norms[to])

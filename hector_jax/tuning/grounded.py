@@ -49,11 +49,14 @@ def carry_from(
 
 
 class Grounding(NamedTuple):
-    """Start and residuals of rollouts grounded on a measured walk of T ticks.
+    """The model with start and residuals of rollouts grounded on a measured walk of T ticks.
 
     Estimates are not used: commands are planned anew, from the true states of the walk.
     """
 
+    robot: Robot  # nominal body
+    command: Command  # of the walk
+    effect: jax.tree_util.Partial  # phi
     start: Carry  # at the end of the first tick
     tick: Int[Array, ""]  # gait tick at the start
     residuals: MeasuredState  # (T - 1, ...) measured less modelled values at the end of a tick
@@ -80,13 +83,10 @@ def fit_grounding(
         start_tick: gait tick of t = 0.
 
     Raises:
-        ValueError: the walk has another number of ticks.
+        ValueError: the walk has another number of ticks, from `jax.lax.scan`.
 
     Source: Eq. 12, 13 at the measured states.
     """
-    ticks = config.ticks
-    if len(walk.fallen) != ticks:
-        raise ValueError(f"a walk of {ticks} ticks has {len(walk.fallen)} samples")
     measured = measured_states(robot, walk.state, walk.joints)
     first, command_before = jax.tree.map(lambda x: x[0], (measured, walk.command))
     anchor, tick = anchor_at(robot, walk.initial, start_tick), jnp.asarray(start_tick) + 1
@@ -100,30 +100,25 @@ def fit_grounding(
 
     begins, ends = jax.tree.map(lambda x: x[:-1], measured), jax.tree.map(lambda x: x[1:], measured)
     memory = command_history(command_before), NO_DISTURBANCE
-    _, residuals = jax.lax.scan(step, memory, (begins, ends, tick + jnp.arange(ticks - 1)))
-    return Grounding(carry_from(first, anchor, *memory), tick, residuals)
+    _, residuals = jax.lax.scan(step, memory, (begins, ends, tick + jnp.arange(config.ticks - 1)))
+    start = carry_from(first, anchor, *memory)
+    return Grounding(robot, command, effect, start, tick, residuals)
 
 
-def grounded_rollout(
-    config: RolloutConfig,
-    robot: Robot,
-    weights: Weights,
-    command: Command,
-    effect: jax.tree_util.Partial,
-    grounding: Grounding,
-) -> Trajectory:
+def grounded_rollout(config: RolloutConfig, grounding: Grounding, weights: Weights) -> Trajectory:
     """Walk on the model from the end of a walk's first tick, adding its residuals.
 
     Args:
-        config, robot, command, effect: those of the grounding.
-        weights: theta; the gradient is taken with respect to these.
+        config: that of the grounding.
         grounding: see `fit_grounding`.
+        weights: theta; the gradient is taken with respect to these.
 
     Returns:
         Trajectory of T - 1 samples. Nothing raises: check `fallen` and `residual`.
 
     Source: Eq. 12, 13 and the measured residuals.
     """
+    robot, command, effect, start, tick, residuals = grounding
 
     @partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(qp.SAVED))
     def step(carry: Carry, inputs: tuple) -> tuple[Carry, Trajectory]:
@@ -134,7 +129,6 @@ def grounded_rollout(
         after = after._replace(state=state, feet=feet, fallen=fallen)
         return after, sample._replace(state=state, feet=feet.position, fallen=fallen)
 
-    start, tick, residuals = grounding
     ticks = tick + jnp.arange(len(residuals.feet.yaw))
     _, samples = jax.lax.scan(step, start, (residuals, ticks))
     return samples._replace(initial=start.state, period=jnp.asarray(config.walk.gait.tick))
@@ -142,37 +136,26 @@ def grounded_rollout(
 
 @partial(jax.jit, static_argnums=0)
 def evaluate_grounded(
-    config: RolloutConfig,
-    robot: Robot,
-    weights: Weights,
-    command: Command,
-    effect: jax.tree_util.Partial,
-    grounding: Grounding,
-    loss: Loss,
+    config: RolloutConfig, grounding: Grounding, weights: Weights, loss: Loss
 ) -> Evaluation:
     """Compute the loss of a grounded rollout and its gradient, as `evaluate` of a plain rollout.
 
     Args:
-        config, robot, weights, command, effect, grounding: see `grounded_rollout`.
+        config, grounding, weights: see `grounded_rollout`.
         loss: terms and their weights; changes of the command count after the first tick.
 
     Source: Eq. 9, 11.
     """
-    inputs = {"command": command, "effect": effect, "grounding": grounding}
-    return evaluation(partial(grounded_rollout, config, robot, **inputs), weights, loss)
+    return evaluation(partial(grounded_rollout, config, grounding), weights, loss)
 
 
-@partial(jax.jit, static_argnums=0, static_argnames="others")
+@partial(jax.jit, static_argnames=("config", "others"))
 def grounded_matrix(
     config: RolloutConfig,
-    robot: Robot,
-    weights: Weights,
-    command: Command,
-    effect: jax.tree_util.Partial,
     grounding: Grounding,
+    weights: Weights,
     loss: Loss,
     others: tuple[str, ...] = (),
 ) -> Float[Array, "n n"]:
     """Compute the Gauss-Newton matrix of a grounded rollout; see `curvature.gauss_newton`."""
-    inputs = {"command": command, "effect": effect, "grounding": grounding}
-    return matrix(partial(grounded_rollout, config, robot, **inputs), weights, loss, others)
+    return matrix(partial(grounded_rollout, config, grounding), weights, loss, others)

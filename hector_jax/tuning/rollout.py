@@ -191,19 +191,6 @@ def _moved_by(
     return shifted(stepped, -variation.com)
 
 
-def _respond(
-    effect: jax.tree_util.Partial,
-    state: State,
-    commands: Wrench,
-    contact: Bool[Array, " feet"],
-    since_switch: Float[Array, ""],
-) -> Effect:
-    """Evaluate phi, whose input and output are in the yaw frame; returns the world frame."""
-    yaw = state.euler[2]
-    window = Window(turn(commands, -yaw), contact, since_switch, base=from_yaw_frame(state))
-    return turn(effect(window), yaw)
-
-
 def _estimate(
     carry: Carry, tick: Int[Array, ""], variation: Variation | None
 ) -> tuple[State, Feet, State | None]:
@@ -291,8 +278,12 @@ def step_carry(
     commands = jax.tree.map(
         lambda new, old: jnp.concatenate([new[None], old[:-1]]), planned.wrench, carry.commands
     )
-    since = gait.since_switch(walk.gait, tick)
-    response = _respond(effect, carry.state, commands, planned.contact, since)
+    since, yaw = (
+        gait.since_switch(walk.gait, tick),
+        carry.state.euler[2],
+    )  # phi's frame is the yaw's
+    window = Window(turn(commands, -yaw), planned.contact, since, from_yaw_frame(carry.state))
+    response = turn(effect(window), yaw)
     response, feet = _on_real_ground(carry, response, planned, error, variation)
     if variation is None:
         state = srbm.step(robot, carry.state, response.wrench, feet.position, dt, response.legs)
