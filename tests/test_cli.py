@@ -105,6 +105,7 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
     monkeypatch.setattr(
         arguments, "walk_once", lambda *args, **kwargs: walk._replace(fallen=fallen)
     )
+    monkeypatch.setattr(evaluate, "fall_of", lambda *args: None)  # it does not fall again
     assert call(monkeypatch, "walk") == 0
     assert "nominal weights: fell after 0.20 s" in capsys.readouterr().out
 

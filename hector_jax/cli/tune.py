@@ -39,7 +39,10 @@ from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, Journal, r
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.runs.walks import Campaign, Row, candidates, changes, tune_on_walks
+from hector_jax.sim.diagnosis import fall_of
 from hector_jax.sim.engine import choose_engine
+from hector_jax.sim.loop import Job
+from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.curvature import Determined, determined
 from hector_jax.tuning.difftune import Tuning
@@ -47,6 +50,7 @@ from hector_jax.tuning.evaluate import aligned
 from hector_jax.tuning.loss import smoother
 
 _FOLDERS = ("out", "resume")  # flags that name the run folder
+_ARTEFACTS = "kept"  # folder in it
 
 
 def tune(args: Tune) -> None:
@@ -93,7 +97,7 @@ class _Run(NamedTuple):
     @property
     def artefacts(self) -> Path:
         """Folder of the artefacts."""
-        return self.folder / "kept"
+        return self.folder / _ARTEFACTS
 
     @property
     def seconds(self) -> float:
@@ -139,9 +143,10 @@ def _tune_in(folder: Path, args: Tune) -> None:
     data = arguments.robot_folder(args.data, args.robot, robot)
     net = nets.load_net(args.net, robot, args.variant)[0] if args.net else None
     with workers(args.processes) as pool:
-        for line in tunings.compile_programs(pool, config, robot, start, trajectories[0]):
-            say(f"before any tuning, {trajectories[0].name} on hfs with nominal weights: {line}")
         setup = Setup(pool, config, robot, made_with.get("commit", ""))
+        _check_start(setup, args, start, trajectories, folder / _ARTEFACTS / "hfs")
+        for line in tunings.compile_programs(pool, config, robot, start, trajectories[0]):
+            say(f"before any tuning, {trajectories[0].name} on hfs: {line}")
         net = net or nets.load_or_train(pool, robot, data, args.variant)
         run = _Run(setup, folder, args, start, trajectories, net)
         norms = tunings.gradient_norms(run.setup, run.problems)
@@ -179,6 +184,35 @@ def _tune_in(folder: Path, args: Tune) -> None:
     print_text = partial(_print_tables, by_name, args.seeds, show)
     print_result(args.json, {"run": str(folder), "traj": run.name, **result}, print_text)
     say(f"the report is {report}")
+
+
+def _check_start(
+    setup: Setup,
+    args: Tune,
+    start: Weights,
+    trajectories: Sequence[NamedCommand],
+    folder: Path,
+) -> None:
+    """Walk with the weights at the start on the hfs; `_walk_sets` reads these walks again.
+
+    Raises:
+        InputError: the robot falls; the line has the likeliest cause and what to change.
+    """
+    name, pool = args.start if args.start in BASELINES else "start", setup.pool
+    robot, case = jax.tree.map(np.asarray, setup.robot), (name, 0)
+    for trajectory in trajectories:
+        inputs = start, trajectory.command, hfs(robot.description)
+        job = Job(*inputs, seconds=trajectory.seconds or Walk.seconds)
+        title = f"walking {trajectory.name} with the weights to start from"
+        options = {"title": title, "folder": folder, "with_walk": [case]}
+        scored, _ = verdicts.score_jobs(setup, {case: job}, **options)[case]
+        if scored.score.fallen:
+            walk = setup.config.rollout.walk
+            fall = pool.submit(fall_of, walk, robot, on_host(job)).result()
+            raise InputError(
+                f"--start {args.start} cannot be tuned from: {trajectory.name} on the "
+                f"high-fidelity simulator {fall or 'fell'}"
+            )
 
 
 def _print_tables(

@@ -387,9 +387,17 @@ def single(tunings: Tuning, row: int) -> Tuning:
     count = 1 + int(np.max(found.history.iteration))
     found = found._replace(history=jax.tree.map(lambda x: x[:count], found.history))
     if found.stop == Stop.BAD_START:
-        reason = found.iterations[0].reason
-        raise InputError(f"the starting weights cannot be tuned from: {reason}")
+        check_start(found.iterations[0].reason)
     return found
+
+
+def check_start(reason: str) -> None:
+    """Raise an InputError with the reason why the start of a tuning is rejected, unless empty."""
+    if reason:
+        raise InputError(
+            f"the starting weights cannot be tuned from: {reason} (try a slower or "
+            "shorter trajectory, another gait, or other weights as the start)"
+        )
 
 
 def needs_matrix(config: TuneConfig, state: TuneState, evaluation: Evaluation) -> Any:
