@@ -12,7 +12,6 @@ from pretend import pretend_walk
 
 from hector_jax.cli import arguments, evaluate
 from hector_jax.cli import tune as tuning
-from hector_jax.cli.flags import Tune
 from hector_jax.cli.main import main
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
@@ -201,7 +200,7 @@ def test_a_start_that_falls_is_refused_before_anything_is_collected(monkeypatch,
             f"--start nominal cannot be tuned from: s on the high-fidelity simulator {TEXT}"
         )
         with pytest.raises(InputError, match=line):
-            tuning._check_start(setup, Tune(), nominal(), both, tmp_path)
+            tuning._check_start(setup, "nominal", nominal(), both, tmp_path)
         assert len(made) == 2
         # a run walks its sets there later, and reads the walk of the start
         inputs = setup, {"nominal": nominal()}, both[0].command, [hfs()], [0]

@@ -144,7 +144,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     net = nets.load_net(args.net, robot, args.variant)[0] if args.net else None
     with workers(args.processes) as pool:
         setup = Setup(pool, config, robot, made_with.get("commit", ""))
-        _check_start(setup, args, start, trajectories, folder / _ARTEFACTS / "hfs")
+        _check_start(setup, args.start, start, trajectories, folder / _ARTEFACTS / "hfs")
         for line in tunings.compile_programs(pool, config, robot, start, trajectories[0]):
             say(f"before any tuning, {trajectories[0].name} on hfs: {line}")
         net = net or nets.load_or_train(pool, robot, data, args.variant)
@@ -187,32 +187,24 @@ def _tune_in(folder: Path, args: Tune) -> None:
 
 
 def _check_start(
-    setup: Setup,
-    args: Tune,
-    start: Weights,
-    trajectories: Sequence[NamedCommand],
-    folder: Path,
+    setup: Setup, text: str, start: Weights, trajectories: Sequence[NamedCommand], folder: Path
 ) -> None:
     """Walk with the weights at the start on the hfs; `_walk_sets` reads these walks again.
 
     Raises:
         InputError: the robot falls; the line has the likeliest cause and what to change.
     """
-    name, pool = args.start if args.start in BASELINES else "start", setup.pool
-    robot, case = jax.tree.map(np.asarray, setup.robot), (name, 0)
-    for trajectory in trajectories:
-        inputs = start, trajectory.command, hfs(robot.description)
-        job = Job(*inputs, seconds=trajectory.seconds or Walk.seconds)
-        title = f"walking {trajectory.name} with the weights to start from"
-        options = {"title": title, "folder": folder, "with_walk": [case]}
-        scored, _ = verdicts.score_jobs(setup, {case: job}, **options)[case]
-        if scored.score.fallen:
-            walk = setup.config.rollout.walk
-            fall = pool.submit(fall_of, walk, robot, on_host(job)).result()
-            raise InputError(
-                f"--start {args.start} cannot be tuned from: {trajectory.name} on the "
-                f"high-fidelity simulator {fall or 'fell'}"
-            )
+    robot, case = setup.robot, (text if text in BASELINES else "start", 0)
+    plant = hfs(robot.description)
+    for name, command, seconds in trajectories:
+        job = Job(start, command, plant, seconds or Walk.seconds)
+        options = {"title": f"walking {name} with the weights to start from", "folder": folder}
+        walks = verdicts.score_jobs(setup, {case: job}, **options, with_walk=[case])
+        if walks[case][0].score.fallen:
+            inputs = setup.config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
+            fall = setup.pool.submit(fall_of, *inputs).result() or "fell"
+            where = f"{name} on the high-fidelity simulator"
+            raise InputError(f"--start {text} cannot be tuned from: {where} {fall}")
 
 
 def _print_tables(

@@ -24,8 +24,9 @@ from hector_jax.sim.world import World
 
 AT_LIMIT = 0.98  # share of a limit: behind a lag that of a torque is only approached
 MOST_AT_LIMIT = 0.05  # share of a walk for which a motor may be at its limit
-# What lasts for more than a tenth of the last second may have caused a fall: in walks of the examples
-# without one soles tilt for at most 5 % of a second and feet slip for 9 %, the strider's for 23 %
+# What lasts for more than a tenth of the last second may have caused a fall. In walks of the
+# examples without one soles tilt for at most 5 % of a second, and feet slip for 9 %, the strider's
+# for 23 %.
 BEFORE_FALL, MOST_BEFORE_FALL = 1.0, 0.1  # [s], share
 LOADED = 0.2  # share of the weight on a foot that stands; less bears it when it lands and leaves
 TILTED = 0.2  # [rad] of the sole of a foot that stands; a soft floor allows a tenth of it
@@ -98,18 +99,16 @@ def record_walk(config: WalkConfig, robot: Robot, job: Job) -> Record:
         roll, pitch = np.arctan2(up[1], up[2]), -np.arcsin(np.clip(up[0], -1.0, 1.0))
         height = data.qpos[2] + up @ robot.com_offset
         torque = data.ctrl / world.model.actuator_ctrlrange[:, 1]
-        contacts = _contacts(world, data, len(feet))
+        *contacts, touching[:] = _contacts(world, data, len(feet))
         soles = [_tilt_of(np.array([data.geom(name).xpos for name in f.contacts])) for f in feet]
-        touching[:] = _on_floor(world, data)
         # false for values that are not finite
         upright = height >= min_height and max(abs(roll), abs(pitch)) <= max_tilt
         fallen = bool(touching) or not upright
         rows.append((height, (roll, pitch), torque, *contacts, soles, fallen))
 
     trajectory = walk(config, robot, job, build=partial(MujocoPlant, on_step=append))
-    height, angles, torque, force, use, legs_touch, sole, fallen = map(
-        np.array, zip(*rows, strict=True)
-    )
+    columns = map(np.array, zip(*rows, strict=True))
+    height, angles, torque, force, use, legs_touch, sole, fallen = columns
     lead = (job.start_tick - first_tick(config)) * substeps(config)
     return Record(
         time=TIME_STEP * (1 + np.arange(len(rows)) - lead),
@@ -128,17 +127,26 @@ def record_walk(config: WalkConfig, robot: Robot, job: Job) -> Record:
 
 def _contacts(
     world: World, data: mujoco.MjData, feet: int
-) -> tuple[Float[np.ndarray, " feet"], Float[np.ndarray, " feet"], bool]:
-    """Return the floor's force on each foot [N], its share of the friction, and if legs touch."""
-    force, used, legs_touch, local = np.zeros(feet), np.zeros(feet), False, np.zeros(6)
+) -> tuple[Float[np.ndarray, " feet"], Float[np.ndarray, " feet"], bool, list[str]]:
+    """Return what touches in a millisecond.
+
+    Returns:
+        Force [N] of the floor on each foot; the share of its friction in use; whether legs touch;
+        names of geoms, or of their bodies, that touch the floor and are of no foot.
+    """
+    force, used, legs_touch, names, local = *np.zeros((2, feet)), False, set(), np.zeros(6)
     for i, contact in enumerate(data.contact):
-        legs_touch |= world.floor not in contact.geom
-        foot = world.foot_of_geom[contact.geom].max()  # -1 for the floor
-        if foot >= 0 and world.floor in contact.geom:
+        geom = contact.geom[contact.geom != world.floor][0]
+        foot, part = world.foot_of_geom[geom], world.model.geom(geom)
+        if world.floor not in contact.geom:
+            legs_touch = True
+        elif foot < 0:
+            names.add(part.name or world.model.body(part.bodyid[0]).name)
+        else:
             mujoco.mj_contactForce(world.model, data, i, local)
             force[foot] += local[0]
             used[foot] += np.abs(local[1:3]).sum() / contact.friction[0]
-    return force, used / np.maximum(force, 1e-9), legs_touch
+    return force, used / np.maximum(force, 1e-9), legs_touch, sorted(names)
 
 
 def _tilt_of(points: Float[np.ndarray, "c 3"]) -> float:
@@ -146,17 +154,6 @@ def _tilt_of(points: Float[np.ndarray, "c 3"]) -> float:
     above = points - points[np.argmin(points[:, 2])]
     slopes = np.arctan2(above[:, 2], np.linalg.norm(above[:, :2], axis=1))
     return float(slopes.max())
-
-
-def _on_floor(world: World, data: mujoco.MjData) -> list[str]:
-    """Return the names of geoms, or of their bodies, that touch the floor and are of no foot."""
-    names = set()
-    for first, second in data.contact.geom[: data.ncon]:
-        geom = second if first == world.floor else first
-        if world.floor in (first, second) and world.foot_of_geom[geom] < 0:
-            part = world.model.geom(geom)
-            names.add(part.name or world.model.body(part.bodyid[0]).name)
-    return sorted(names)
 
 
 def _motors(robot: Robot, torque: Float[np.ndarray, "n joints"]) -> Iterator[Fault]:
