@@ -52,7 +52,7 @@ def robot():
     return load_robot()
 
 
-def gather(folder, robot, draw=0, **others):
+def gather(folder, robot, /, draw=0, **others):
     """Toy walks with the card of those that a command would collect, but for `others`."""
     collect(
         folder,
@@ -152,6 +152,7 @@ def test_data_follow_from_their_own_settings_whatever_command_makes_them(tmp_pat
         ({"walks": 128}, "walks: made with walks 128, this command expects 64"),
         ({"paths": "short"}, "walks: made with paths 'short', this command expects"),
         ({"controller": "another"}, "walks: made with controller 'another'"),
+        ({"robot": "b", "controller": "another"}, "walks: made for another robot of this name"),
         ({"code": "older"}, "walks: made by other code or other versions of jax, jaxlib, mujoco"),
     ],
 )
