@@ -353,7 +353,7 @@ def _tex_change(comparison: Comparison) -> str:
 def _tex(table: Table, sets: Summaries) -> str:
     """Return a tabular that needs no package; the smallest mean of a trajectory is bold."""
     count = len(table.seeds)
-    powers = {p: column(p, max(s.means[p].value for s in sets.values())).power for p in PARTS}
+    powers = {p: column(p, *(s.means[p].value for s in sets.values())).power for p in PARTS}
     sections = {}
     for trajectory, verdict in table.verdicts.items():
         by_name = {name: sets[trajectory, name] for name in verdict.scores}

@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -105,8 +106,34 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
     monkeypatch.setattr(
         arguments, "walk_once", lambda *args, **kwargs: walk._replace(fallen=fallen)
     )
+    monkeypatch.setattr(evaluate, "fall_of", lambda *args: None)  # it does not fall again
     assert call(monkeypatch, "walk") == 0
     assert "nominal weights: fell after 0.20 s" in capsys.readouterr().out
+
+
+def test_what_mujoco_warns_of_in_a_file_is_one_line(monkeypatch, capsys, tmp_path):
+    text = MODEL_PATH.read_text().replace("<compiler ", '<compiler settotalmass="12" ')
+    (tmp_path / "hector.xml").write_text(text)
+    (tmp_path / "robot.toml").write_text(MODEL_PATH.with_suffix(".toml").read_text())
+    robot = tmp_path / "robot.toml"
+    assert call(monkeypatch, "walk", "--robot", robot, "--seconds", "0.05") == 0
+    lines = [x for x in capsys.readouterr().err.splitlines() if "settotalmass" in x]
+    assert len(lines) == 1
+    assert lines[0].startswith("warning: compiler attribute 'settotalmass'")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "says"), [("hector", "straight", 0), ("hector", "c", 1), ("quadruped", "c", 0)]
+)
+def test_a_curve_without_a_yaw_joint_is_told(capsys, name, text, says):
+    file = {"quadruped": Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml"}
+    robot = load_robot(file.get(name))
+    placed = tuple(row for row in robot.structure.placed if row != 5)
+    arguments.load_trajectory(text, robot)
+    assert capsys.readouterr().err == ""
+    robot = robot._replace(structure=replace(robot.structure, placed=placed))
+    arguments.load_trajectory(text, robot)
+    assert capsys.readouterr().err.count("no yaw joint") == says
 
 
 def test_a_newline_in_the_name_of_a_file_is_not_printed(monkeypatch, capsys, tmp_path):

@@ -1,6 +1,7 @@
-"""What is told of a walk that goes wrong and not by its weights: falls before t = 0, motors."""
+"""What is told of a walk that goes wrong: why it fell, and what no weights mend."""
 
 import json
+import re
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -14,25 +15,27 @@ from hector_jax.cli import tune as tuning
 from hector_jax.cli.main import main
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
-from hector_jax.control.trajectories import command_of
+from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import nominal
+from hector_jax.core.inputs import InputError
 from hector_jax.report.report import render
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import metrics, tunings, verdicts
 from hector_jax.runs.setup import Setup
 from hector_jax.sim import diagnosis
-from hector_jax.sim.diagnosis import Record, StartupFall, likeliest_cause, not_the_weights
+from hector_jax.sim.diagnosis import Fall, Record, likeliest_cause, not_the_weights
 from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.evaluate import Evaluation, Objective
 from hector_jax.tuning.loss import PAPER_LOSS
 
 ROBOT, STRAIGHT = load_robot(), named_command("straight")
 JOB = Job(nominal(), STRAIGHT, hfs(), 1.0)
 STANDING = float(ROBOT.standing_height)
-FALL = StartupFall(-0.42, 0.21, 0.93, "it tips over forwards (standing pose, joint gains, gait)")
+FALL = Fall(-0.42, 0.21, 0.93, "it tips over forwards (standing pose, joint gains, gait)")
 TEXT = (
     "fell at -0.42 s, in the start-up: centre of mass 0.21 m high, tilt 0.93 rad; likeliest cause: "
     "it tips over forwards (standing pose, joint gains, gait)"
@@ -44,16 +47,22 @@ def fallen_at_once(seed=0, seconds=1.0):
     return walked._replace(fallen=np.ones_like(walked.fallen))
 
 
-def recorded(height=0.0, angles=(0.0, 0.0), knee=0.0, *, fallen=True, touching="", walked=None):
-    """A second that ends with these, and began standing; the left knee's torque all along."""
+def recorded(
+    height=0.0, angles=(0.0, 0.0), knee=0.0, *, fallen=True, touching="", walked=None, **feet
+):
+    """A second that ends with these, and began standing; torque and feet are so all along."""
     rise = np.linspace(0.0, 1.0, 1000)
     torque = np.zeros((1000, 10))
     torque[:, 3] = knee
+    feet = {"load": (0.0, 1.0), "friction": (0.0, 0.5), "sole": (0.0, 0.0)} | feet
+    rows = {name: np.tile(value, (1000, 1)) for name, value in feet.items() if name != "legs"}
     return Record(
         time=0.001 * (1 + np.arange(1000)) - 1.0,
         height=STANDING + height * rise,
         angles=np.outer(rise, angles),
         torque=torque,
+        **rows,
+        legs_touch=rise >= 1.0 - feet.get("legs", 0.0),
         touching=touching,
         fallen=fallen,
         trajectory=fallen_at_once() if walked is None else walked,
@@ -72,6 +81,11 @@ def unsolved():
         (recorded(fallen=False), "the physics diverges"),
         (recorded(-0.2, walked=unsolved()), "a QP of the MPC is not solved"),
         (recorded(-0.2, knee=1.0), "the torque of left_knee is at its limit of 67 N m for 100 %"),
+        (recorded(-0.2, sole=(0.0, 0.3)), "the right foot stands on an edge of its sole"),
+        (recorded(-0.2, friction=(0.0, 0.99)), "the right foot slips, at the limit of the floor's"),
+        (recorded(0.06, (0.0, 0.9), legs=0.9), "the legs touch each other for 78 % of the 0.45 s"),
+        # a foot in the air
+        (recorded(0.06, (0.0, 0.9), friction=(0.99, 0.0), sole=(0.3, 0.0)), "it tips over"),
         (recorded(-0.2), "the centre of mass sinks steadily, by 9 cm while still upright"),
         (recorded(0.2, (0.0, 0.3)), "the centre of mass rises steadily, by 20 cm"),
         (recorded(0.06, (0.0, 0.9)), "it tips over forwards"),
@@ -101,7 +115,7 @@ def test_a_fall_in_the_start_up_is_that_of_the_walk():
         build=partial(MujocoPlant, on_step=lambda world, data: rows.append(data.qpos[2])),
     )
     assert walked.fallen.all()
-    fall = diagnosis.startup_fall(config, ROBOT, heavy)
+    fall = diagnosis.fall_of(config, ROBOT, heavy)
     assert fall is not None
     assert -1.1 < fall.time < -0.5
     # the walk goes on to the end of the ten ticks in which it falls
@@ -109,7 +123,26 @@ def test_a_fall_in_the_start_up_is_that_of_the_walk():
     assert fall.height == pytest.approx(float(walked.initial.position[2]), abs=5e-3)
     assert fall.height < ROBOT.description.min_height
     assert "sinks steadily" in fall.cause
-    assert diagnosis.startup_fall(config, ROBOT, JOB._replace(seconds=0.05)) is None
+    assert diagnosis.fall_of(config, ROBOT, JOB._replace(seconds=0.05)) is None
+
+
+@pytest.mark.parametrize(
+    ("plant", "cause"),
+    [
+        (hfs()._replace(floor_friction=np.array(0.3)), "foot slips"),
+        (hfs()._replace(torque_gain=np.full(10, 0.3)), "sinks steadily"),
+    ],
+)
+def test_a_fall_of_a_walk_has_the_cause_of_its_plant(plant, cause):
+    s, config = named_command("s"), WalkConfig()
+    job = JOB._replace(command=s, imperfections=plant, seconds=2.0)
+    walked = walk(config, ROBOT, job)
+    fall = diagnosis.fall_of(config, ROBOT, job)
+    assert fall is not None
+    assert fall.time > 0.0
+    assert fall.time == pytest.approx(0.001 * np.sum(~walked.fallen))
+    assert cause in fall.cause
+    assert str(fall).startswith(f"fell after {fall.time:.2f} s: ")
 
 
 # What no weights mend
@@ -138,7 +171,8 @@ def test_a_height_that_is_off_and_motors_at_their_limits_are_told(monkeypatch):
     record.torque[:100, 2], record.torque[:30, 5] = -0.99, 1.0
     height, torque = lines(monkeypatch, record)
     assert height.startswith("the centre of mass is 4.0 cm below its reference all along")
-    assert torque == "the torque of left_hip_pitch is at its limit of 33.5 N m for 10 % of the time"
+    text = "the torque of left_hip_pitch is at its limit of 33.5 N m for 10 % of the time"
+    assert torque.startswith(f"{text} (try a slower trajectory")
 
 
 def test_what_leads_to_a_fall_is_not_told_as_steady(monkeypatch):
@@ -149,13 +183,39 @@ def test_what_leads_to_a_fall_is_not_told_as_steady(monkeypatch):
     assert lines(monkeypatch, record) == []
 
 
-def test_a_fall_in_the_start_up_is_found_before_any_tuning(monkeypatch):
-    monkeypatch.setattr(diagnosis, "record_walk", lambda *args: recorded())
-    monkeypatch.setattr(diagnosis, "startup_fall", lambda *args: FALL)
-    monkeypatch.setattr(tunings, "_prepare_tuning", lambda *args: None)
+def test_a_start_that_falls_is_refused_before_anything_is_collected(monkeypatch, tmp_path):
+    made = []
+
+    def walks_of(setup, jobs, title, engine):
+        made.extend(jobs)
+        yield from (pretend_walk(fall_at=0.5 if job.command is S else None) for job in jobs)
+
+    monkeypatch.setattr(verdicts, "walk_jobs", walks_of)
+    monkeypatch.setattr(tuning, "fall_of", lambda *args: FALL)
+    both = [NamedCommand(name, named_command(name)) for name in ("straight", "s")]
+    S = both[1].command
     with ThreadPoolExecutor(1) as pool:
-        inputs = TuneConfig(), ROBOT, nominal(), command_of("straight")
-        assert tunings.compile_programs(pool, *inputs) == [TEXT]
+        setup = Setup(pool, TuneConfig(), ROBOT)
+        line = re.escape(
+            f"--start nominal cannot be tuned from: s on the high-fidelity simulator {TEXT}"
+        )
+        with pytest.raises(InputError, match=line):
+            tuning._check_start(setup, "nominal", nominal(), both, tmp_path)
+        assert len(made) == 2
+        # a run walks its sets there later, and reads the walk of the start
+        inputs = setup, {"nominal": nominal()}, both[0].command, [hfs()], [0]
+        verdicts.judge(*inputs, title="", folder=tmp_path)
+    assert len(made) == 2
+
+
+def test_a_start_that_falls_on_the_model_is_refused_before_anything_is_collected(monkeypatch):
+    zero = np.zeros(())
+    fell = Evaluation(zero, {}, nominal(), fallen=np.ones(()), residual=zero)
+    objective = Objective(lambda weights: fell, lambda weights: None)
+    monkeypatch.setattr(tunings.difftune, "model_objective", lambda *args, **model: objective)
+    inputs = TuneConfig(), ROBOT, nominal(), named_command("straight")
+    with pytest.raises(InputError, match="the robot fell .try a slower or shorter trajectory"):
+        tunings._prepare_tuning(*inputs, False)
 
 
 def test_a_tuned_set_that_walks_worse_than_nominal_is_told(capsys):
@@ -177,7 +237,7 @@ def test_a_tuned_set_that_walks_worse_than_nominal_is_told(capsys):
 
 def test_hector_walk_tells_the_fall_and_prints_no_nan(monkeypatch, capsys):
     monkeypatch.setattr(arguments, "walk_once", lambda *args, **kwargs: fallen_at_once())
-    monkeypatch.setattr(evaluate, "startup_fall", lambda *args: FALL)
+    monkeypatch.setattr(evaluate, "fall_of", lambda *args: FALL)
     monkeypatch.setattr(sys, "argv", ["hector", "walk"])
     assert main() == 0
     out = capsys.readouterr().out
@@ -187,7 +247,7 @@ def test_hector_walk_tells_the_fall_and_prints_no_nan(monkeypatch, capsys):
     assert main() == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["seconds"], told["fell"]) == (-0.42, True)
-    assert told["startup"] == FALL._asdict()
+    assert told["fall"] == FALL._asdict()
     assert told["rms_position"] == [None] * 3
 
 
@@ -202,7 +262,7 @@ def test_an_evaluation_has_the_fall_before_t_0_and_tells_it_once_a_set(
             yield pretend_walk(1, seconds=1.0) if job.seed == 1 else fallen_at_once(job.seed)
 
     monkeypatch.setattr(verdicts, "walk_jobs", walks_of)
-    monkeypatch.setattr(verdicts, "startup_fall", lambda *args: FALL)
+    monkeypatch.setattr(verdicts, "fall_of", lambda *args: FALL)
     for _ in range(2):  # as walked, and from the folder
         with ThreadPoolExecutor(1) as pool:
             found = verdicts.judge(

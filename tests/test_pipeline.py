@@ -15,7 +15,7 @@ from model import LEARNS_TOUCHDOWNS
 from pretend import pretend_walk
 from synthetic import synthetic_walk
 
-from hector_jax.cli import commands, flags
+from hector_jax.cli import commands, flags, tune
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import (
@@ -52,7 +52,7 @@ def robot():
     return load_robot()
 
 
-def gather(folder, robot, draw=0, **others):
+def gather(folder, robot, /, draw=0, **others):
     """Toy walks with the card of those that a command would collect, but for `others`."""
     collect(
         folder,
@@ -128,6 +128,7 @@ def test_data_follow_from_their_own_settings_whatever_command_makes_them(tmp_pat
 
     monkeypatch.setattr(nets, "collect", collect)
     monkeypatch.setattr(tunings, "compile_programs", lambda *args: [])  # it walks
+    monkeypatch.setattr(tune, "_check_start", lambda *args: None)  # it walks
     for command in (
         flags.Tune(iterations=10, data=tmp_path / "data", out=tmp_path / "run"),
         flags.Grfm(data=tmp_path / "data", out=tmp_path / "grfm"),
@@ -150,6 +151,7 @@ def test_data_follow_from_their_own_settings_whatever_command_makes_them(tmp_pat
         ({"walks": 128}, "walks: made with walks 128, this command expects 64"),
         ({"paths": "short"}, "walks: made with paths 'short', this command expects"),
         ({"controller": "another"}, "walks: made with controller 'another'"),
+        ({"robot": "b", "controller": "another"}, "walks: made for another robot of this name"),
         ({"code": "older"}, "walks: made by other code or other versions of jax, jaxlib, mujoco"),
     ],
 )

@@ -142,10 +142,25 @@ def test_walks_on_several_trajectories_are_not_counted_as_plants(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("largest", "power"), [(0.0, 0), (0.5, 0), (12.0, 0), (7e5, 3), (2e6, 6), (0.02, -3)]
+    ("number", "power"), [(0.0, 0), (0.5, 0), (12.0, 0), (7e5, 3), (2e6, 6), (0.02, -3)]
 )
-def test_scales_are_powers_of_a_thousand(largest, power):
-    assert report.column("L", largest).power == power
+def test_scales_are_powers_of_a_thousand(number, power):
+    assert report.column("L", number).power == power
+
+
+@pytest.mark.parametrize(
+    ("numbers", "texts"),
+    [
+        ([1.234e6, 2.345e6, 1.1e8], ["1.23", "2.35", "110.00"]),
+        ([1.234e6, 3e9], ["1.23", "3000.00"]),
+        ([0.0512, 0.71, 5.2], ["0.0512", "0.7100", "5.2000"]),
+        ([0.0, 2.345e6, 12.1e6], ["0.00", "2.35", "12.10"]),
+        ([1e-9, 2.5, 2.6], ["0.0000", "2.5000", "2.6000"]),
+    ],
+)
+def test_a_row_of_falls_leaves_the_others_their_digits(numbers, texts):
+    column = report.column("L", *numbers)
+    assert [column.text(x) for x in numbers] == texts
 
 
 def test_the_report_tells_everything_that_was_promised(tmp_path):

@@ -6,6 +6,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hector_jax.cli.flags import Collect, Evaluate, Search, Train, Verdict, View, Walk
 from hector_jax.control import trajectories
 from hector_jax.control.controller import walk_config
@@ -139,7 +141,7 @@ def with_gait(robot: Robot, name: str) -> Robot:
 
 
 def load_trajectory(text: str, robot: Robot) -> NamedCommand:
-    """Load a trajectory by name or file; one line warns if it may exceed the robot's limits.
+    """Load a trajectory by name or file; one line warns if it may exceed what the robot can do.
 
     A robot whose feet all stand stays in place.
 
@@ -152,6 +154,13 @@ def load_trajectory(text: str, robot: Robot) -> NamedCommand:
         command = trajectory.command
         still = command._replace(velocity=0.0 * command.velocity, yaw_rate=0.0 * command.yaw_rate)
         return trajectory._replace(command=still)
+    # rows of a twist that a leg controls: 5 is the yaw of its sole; a point turns on the floor
+    turns, structure = np.any(trajectory.command.yaw_rate), robot.structure
+    if turns and structure.contact != "point" and 5 not in structure.placed:
+        say(
+            f"warning: {text}: the legs cannot turn their soles (no yaw joint), so that a curve "
+            "makes them slip; expect falls, or take a straight trajectory"
+        )
     if trajectory.seconds and (excess := beyond(limits(robot, gait), trajectory.command)):
         say(f"warning: {text}: {excess}")
     return trajectory

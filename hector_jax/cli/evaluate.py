@@ -33,7 +33,7 @@ from hector_jax.robot.model import load_robot
 from hector_jax.runs import metrics, nets, tunings, verdicts
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.walk_log import walk_card
-from hector_jax.sim.diagnosis import StartupFall, startup_fall
+from hector_jax.sim.diagnosis import Fall, fall_of
 from hector_jax.sim.engine import MUJOCO_C, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.tuning.difftune import TuneConfig
@@ -96,14 +96,13 @@ def walk(args: Walk) -> None:
     walk_with = partial(arguments.walk_once, args, robot, command, plant=plant, engine=engine)
     trajectory = walk_with(weights)
     score = metrics.score(loss, trajectory)
-    upright, startup = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen))), None
-    # a fall in the start-up is simulated again in MuJoCo C to find its cause
-    if upright == 0.0 and args.world != "srbm" and not engine.differs:
-        job = arguments.job_of(args, robot, command, weights, plant)
-        startup = startup_fall(config, robot, job)
+    upright, fall = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen))), None
     samples = round(config.gait.tick / float(trajectory.period))  # per plan
     residuals = np.asarray(trajectory.residual)[::samples]
     unsolved = int(np.sum(~(residuals <= SOLVED)))
+    fell = bool(score.fallen) and not unsolved  # without a plan, it is not due to the weights
+    if fell and args.world != "srbm" and not engine.differs:
+        fall = fall_of(config, robot, arguments.job_of(args, robot, command, weights, plant))
     if args.out is not None:
         seconds = arguments.walk_seconds(args, command)
         about = as_table(args) | {"walk": walk_card(*command[:2], weights, robot, seconds)}
@@ -113,17 +112,16 @@ def walk(args: Walk) -> None:
     title = f"{command.name} in {where}, {printable(args.weights)} weights"
     result: dict[str, Any] = {
         "engine": engine.name,
-        "seconds": upright if startup is None else startup.time,
-        # without a plan, the fall is not due to the weights
-        "fell": bool(score.fallen) and not unsolved,
-        **({} if startup is None else {"startup": startup._asdict()}),
+        "seconds": upright if fall is None else fall.time,
+        "fell": fell,
+        **({} if fall is None else {"fall": fall._asdict()}),
         **({} if plant is None else {"plant": plant.description.name}),
     }
     result |= {part: float(value) for part, value in score.losses.items()}
     # the errors of a walk that falls at once are NaN
     result |= {name: getattr(score, name).tolist() for name in ("rms_position", "rms_euler")}
     result |= {"plans": len(residuals), "unsolved": unsolved, "residual": float(score.residual)}
-    print_result(args.json, result, partial(_print_walk, title, result, score, loss, startup))
+    print_result(args.json, result, partial(_print_walk, title, result, score, loss, fall))
     if unsolved:
         raise Broken(
             f"{unsolved} of {plural(len(residuals), 'QP')} were not solved (largest relative "
@@ -138,10 +136,10 @@ def walk(args: Walk) -> None:
 
 
 def _print_walk(
-    text: str, result: dict[str, Any], score: metrics.Score, loss: Loss, startup: StartupFall | None
+    text: str, result: dict[str, Any], score: metrics.Score, loss: Loss, fall: Fall | None
 ) -> None:
     end = "fell after" if result["fell"] else "ended after" if score.fallen else "walked"
-    end = f"{end} {result['seconds']:.2f} s" if startup is None else str(startup)
+    end = f"{end} {result['seconds']:.2f} s" if fall is None else str(fall)
     terms = ", ".join(f"{term.name} {score.losses[term.name]:.4g} {term.unit}" for term in loss)
     print(f"{text}: {end}; L {score.L / 1e6:.3f}e6 ({terms})")
     if result["seconds"] > 0.0:

@@ -9,7 +9,9 @@ interrupted; 141 standard output was closed; 143 terminated.
 import json
 import logging
 import sys
+import warnings
 from collections.abc import Sequence
+from functools import cache
 
 from hector_jax.core.inputs import InputError, outside_packages
 
@@ -17,7 +19,7 @@ try:
     with outside_packages():
         from hector_jax.cli.flags import Doctor, Export
         from hector_jax.cli.parse import check, from_line, resolve_latest
-        from hector_jax.core.console import Broken, exit_code, say_if_slow
+        from hector_jax.core.console import Broken, exit_code, say, say_if_slow
         from hector_jax.core.runtime import start_jax
 except InputError as error:
     print(f"hector: {error}", file=sys.stderr)
@@ -33,6 +35,8 @@ def _run(words: Sequence[str]) -> None:
     args = resolve_latest(from_line(words))
     check(args)
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # hides messages about its cache
+    say_once = cache(say)  # MuJoCo repeats what it finds in a robot's file each time it reads it
+    warnings.showwarning = lambda message, *where, **_: say_once(f"warning: {message}")
     try:
         with say_if_slow("loading JAX and MuJoCo"):
             start_jax(on_cpu=isinstance(args, Export))  # an export refuses a GPU

@@ -39,12 +39,17 @@ from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, Journal, r
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.runs.walks import Campaign, Row, candidates, changes, tune_on_walks
+from hector_jax.sim.diagnosis import fall_of
 from hector_jax.sim.engine import choose_engine
+from hector_jax.sim.loop import Job
+from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.curvature import Determined, determined
 from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.evaluate import aligned
 from hector_jax.tuning.loss import smoother
+
+_ARTEFACTS = "kept"  # folder in it
 
 
 def tune(args: Tune) -> None:
@@ -90,7 +95,7 @@ class _Run(NamedTuple):
     @property
     def artefacts(self) -> Path:
         """Folder of the artefacts."""
-        return self.folder / "kept"
+        return self.folder / _ARTEFACTS
 
     @property
     def seconds(self) -> float:
@@ -136,9 +141,10 @@ def _tune_in(folder: Path, args: Tune) -> None:
     data = arguments.robot_folder(args.data, args.robot, robot)
     net = nets.load_net(args.net, robot, args.variant)[0] if args.net else None
     with workers(args.processes) as pool:
-        for line in tunings.compile_programs(pool, config, robot, start, trajectories[0]):
-            say(f"before any tuning, {trajectories[0].name} on hfs with nominal weights: {line}")
         setup = Setup(pool, config, robot, made_with.get("commit", ""))
+        _check_start(setup, args.start, start, trajectories, folder / _ARTEFACTS / "hfs")
+        for line in tunings.compile_programs(pool, config, robot, start, trajectories[0]):
+            say(f"before any tuning, {trajectories[0].name} on hfs: {line}")
         net = net or nets.load_or_train(pool, robot, data, args.variant)
         run = _Run(setup, folder, args, start, trajectories, net)
         norms = tunings.gradient_norms(run.setup, run.problems)
@@ -182,6 +188,27 @@ def _tune_in(folder: Path, args: Tune) -> None:
 
     print_result(args.json, {"run": str(folder), "traj": run.name, **result}, print_text)
     say(f"the report is {report}")
+
+
+def _check_start(
+    setup: Setup, text: str, start: Weights, trajectories: Sequence[NamedCommand], folder: Path
+) -> None:
+    """Walk with the weights at the start on the hfs; `_walk_sets` reads these walks again.
+
+    Raises:
+        InputError: the robot falls; the line has the likeliest cause and what to change.
+    """
+    robot, case = setup.robot, (text if text in BASELINES else "start", 0)
+    plant = hfs(robot.description)
+    for name, command, seconds in trajectories:
+        job = Job(start, command, plant, seconds or Walk.seconds)
+        options = {"title": f"walking {name} with the weights to start from", "folder": folder}
+        walks = verdicts.score_jobs(setup, {case: job}, **options, with_walk=[case])
+        if walks[case][0].score.fallen:
+            inputs = setup.config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
+            fall = setup.pool.submit(fall_of, *inputs).result() or "fell"
+            where = f"{name} on the high-fidelity simulator"
+            raise InputError(f"--start {text} cannot be tuned from: {where} {fall}")
 
 
 def _note_settings(run: _Run) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import warnings
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -196,6 +197,8 @@ def start_worker(cores: Any) -> None:
     core = cores.get()
     if core is not None:
         os.sched_setaffinity(0, {core})
+    # MuJoCo's about a robot's file, which the parent has read too
+    warnings.filterwarnings("ignore", category=UserWarning, module="hector_jax")
     import jax
 
     jax.config.update("jax_platforms", "cpu")

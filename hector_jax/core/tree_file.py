@@ -182,6 +182,10 @@ def check_settings(path: Path, made: Mapping[str, Any], expected: Mapping[str, A
         if before == now:
             continue
         what = f"with {name} {short_repr(before)}, this command expects {short_repr(now)}"
+        if name == "robot":
+            what = (
+                "for another robot of this name (`name` in its TOML), or before its files changed"
+            )
         if name == "code":
             what = OTHER_CODE
         raise InputError(f"{path}: made {what}; remove it, or name another folder")

@@ -87,18 +87,24 @@ class Column(NamedTuple):
         return f"{x / 10.0**self.power:.{self.digits}f}"
 
 
-def column(part: str, largest: float) -> Column:
-    """Choose three significant digits of the largest number, divided by a power of a thousand."""
-    if not largest > 0.0:
+def column(part: str, *numbers: float) -> Column:
+    """Choose a power of a thousand for the middle one, and three digits of the smallest number.
+
+    A row of falls, which may be a thousand times as large, decides neither.
+    """
+    positive = sorted(x for x in numbers if x > 0.0)
+    if not positive:
         return Column(part, 0, 2)
-    power = 0 if 0.1 <= largest < 1e3 else 3 * math.floor(math.log10(largest) / 3)
-    return Column(part, power, max(0, 2 - math.floor(math.log10(largest / 10.0**power))))
+    middle = positive[(len(positive) - 1) // 2]
+    power = 0 if 0.1 <= middle < 1e3 else 3 * math.floor(math.log10(middle) / 3)
+    digits = 2 - math.floor(math.log10(positive[0] / 10.0**power))
+    return Column(part, power, min(max(digits, 0), 4))
 
 
 def columns(verdict: Verdict) -> dict[str, Column]:
     """Choose the number format of each part for the tables of a verdict."""
     means = [summary.means for summary in summaries(verdict).values()]
-    return {part: column(part, max(mean[part].value for mean in means)) for part in verdict.parts}
+    return {part: column(part, *(mean[part].value for mean in means)) for part in verdict.parts}
 
 
 def summaries(verdict: Verdict) -> dict[str, Summary]:

@@ -72,12 +72,12 @@ def collection_settings(config: CollectConfig, robot: Robot) -> dict[str, Any]:
     """Return all inputs of the walks of a collection, as JSON values for their card."""
     paths, engine = tune_config(robot), choose_engine(config.engine)
     return {
+        "robot": robot_hash(robot),  # first: another robot has other paths and gains too
         **asdict(config),
         "engine": engine.key,
         "physics_bits": engine.bits(False),
         "controller": repr(paths.rollout.walk),
         "paths": content_key(paths, robot, nominal(robot), code=()),
-        "robot": robot_hash(robot),
         "code": code_hash(*COLLECTION_CODE, *engine.modules),
     }
 

@@ -32,10 +32,11 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
 from hector_jax.tuning import batch, difftune, evaluate
-from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
+from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning, step_status
 from hector_jax.tuning.evaluate import Objective, mean_objective
 from hector_jax.tuning.loss import loss_of_robot
 from hector_jax.tuning.rollout import rollout_config
+from hector_jax.tuning.status import StepStatus
 
 # modules that determine the numbers, for `content_key`
 TUNING_CODE = ("runs.tunings", "tuning.difftune", "grfm.network")
@@ -263,8 +264,14 @@ def _prepare_tuning(
     """Compile the program of a tuning, or only trace it, so that its first call need not."""
     (model,) = _models(config, robot, Problem((command,), None))
     weights = difftune.init(config, start).start
-    for function in difftune.model_objective(config, robot, **model):
-        jax.eval_shape(function, weights) if trace_only else function(weights)
+    objective = difftune.model_objective(config, robot, **model)
+    if trace_only:
+        for function in objective:
+            jax.eval_shape(function, weights)
+        return
+    evaluation = objective.evaluate(weights)
+    difftune.check_start(StepStatus(int(step_status(config, evaluation))), evaluation)
+    objective.matrix(weights)
 
 
 def compile_programs(
@@ -272,14 +279,17 @@ def compile_programs(
 ) -> list[str]:
     """Compile the programs of a tuning in one process; walk once and trace them in another one.
 
-    The other processes load the programs of both from the cache. The walk is with nominal weights
-    on the hfs; its faults that no weights can cure are returned, a line each.
+    The other processes load the programs of both from the cache. The walk is with the weights at
+    the start on the hfs; its faults that no weights can cure are returned, a line each.
 
     Args:
         pool: worker processes.
         config, robot, start, trajectory: of the tuning.
+
+    Raises:
+        InputError: with the weights at the start the model falls or a QP is not solved.
     """
-    job = Job(nominal(robot), trajectory.command, hfs(robot.description))
+    job = Job(start, trajectory.command, hfs(robot.description))
     job = on_host(job._replace(seconds=trajectory.seconds or job.seconds))
     on_hfs = config.rollout.walk, jax.tree.map(np.asarray, robot), job
     inputs = config, robot, start, trajectory.command

@@ -21,7 +21,7 @@ from hector_jax.robot.model import Robot
 from hector_jax.runs import metrics
 from hector_jax.runs.cache import content_key, load_or_make
 from hector_jax.runs.setup import Setup
-from hector_jax.sim.diagnosis import startup_fall
+from hector_jax.sim.diagnosis import fall_of
 from hector_jax.sim.engine import MUJOCO_C, Engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
@@ -84,8 +84,8 @@ def _score_walk(setup: Setup, job: Job, walk: Trajectory, engine: Engine) -> Sco
     upright = samples * float(walk.period)
     if not samples and not engine.differs:
         inputs = config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
-        if startup := pool.submit(startup_fall, *inputs).result():
-            upright, text = startup.time, str(startup)
+        if fall := pool.submit(fall_of, *inputs).result():
+            upright, text = fall.time, str(fall)
     last = jax.tree.map(lambda x: np.asarray(x)[max(samples - 1, 0)], walk.state)
     score = metrics.score(config.loss, walk)
     return ScoredWalk(score, np.asarray(upright), last, commit, text)

@@ -1,10 +1,10 @@
-"""Diagnosis of walks in MuJoCo C that go wrong for other reasons than the weights.
+"""Diagnosis of walks in MuJoCo C that go wrong: why the robot fell, and what no weights can cure.
 
-A trajectory has the samples from t = 0 on. To see a fall in the start-up, or the motors' torques,
-the same walk is simulated once more with each millisecond recorded, so that a normal walk costs
-nothing extra.
+A trajectory has the samples from t = 0 on, without torques and contacts. A walk that fell is
+simulated once more with each millisecond recorded, so that a normal walk costs nothing extra.
 """
 
+from collections.abc import Iterable, Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -22,9 +22,14 @@ from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import World
 
-AT_LIMIT = 0.98  # share of a torque limit: behind a lag the limit is only approached
+AT_LIMIT = 0.98  # share of a limit: behind a lag that of a torque is only approached
 MOST_AT_LIMIT = 0.05  # share of a walk for which a motor may be at its limit
-MOST_BEFORE_FALL = 0.1  # the same before a fall, which must have some cause
+# What lasts for more than a tenth of the last second may have caused a fall. In walks of the
+# examples without one soles tilt for at most 5 % of a second, and feet slip for 9 %, the strider's
+# for 23 %.
+BEFORE_FALL, MOST_BEFORE_FALL = 1.0, 0.1  # [s], share
+LOADED = 0.2  # share of the weight on a foot that stands; less bears it when it lands and leaves
+TILTED = 0.2  # [rad] of the sole of a foot that stands; a soft floor allows a tenth of it
 # [m] least steady error of the height; [s] after t = 0. HECTOR is off by 1.7 cm on its curves.
 STEADY, SETTLED = 0.02, 1.0
 FALLING = 0.5  # [s] before a fall that are not evaluated
@@ -38,6 +43,10 @@ class Record(NamedTuple):
     height: Float[np.ndarray, " n"]  # [m] of the centre of mass
     angles: Float[np.ndarray, "n 2"]  # roll, pitch [rad]
     torque: Float[np.ndarray, "n joints"]  # as a share of the motor's limit
+    load: Float[np.ndarray, "n feet"]  # of the floor on each foot, as a share of the weight
+    friction: Float[np.ndarray, "n feet"]  # of the floor on each foot, as a share of the largest
+    sole: Float[np.ndarray, "n feet"]  # tilt against the floor [rad]; zero for a point
+    legs_touch: Bool[np.ndarray, " n"]
     touching: str  # parts other than feet that touch the floor at the end; empty if none do
     fallen: bool  # the last row is a fall
     trajectory: Trajectory
@@ -48,19 +57,29 @@ class Record(NamedTuple):
         return np.abs(self.angles).max(axis=1)
 
 
-class StartupFall(NamedTuple):
-    """A fall before t = 0."""
+class Fall(NamedTuple):
+    """A fall and its cause."""
 
-    time: float  # [s] after t = 0, so not above zero
+    time: float  # [s] after t = 0; not above zero in the start-up
     height: float  # [m] of the centre of mass
     tilt: float  # [rad], the larger of roll and pitch
-    cause: str  # the likeliest
+    cause: str  # the likeliest, and what to change
 
     def __str__(self) -> str:
+        when = f"after {self.time:.2f} s"
+        when = when if self.time > 0.0 else f"at {self.time:.2f} s, in the start-up"
         return (
-            f"fell at {self.time:.2f} s, in the start-up: centre of mass {self.height:.2f} m high, "
-            f"tilt {self.tilt:.2f} rad; likeliest cause: {self.cause}"
+            f"fell {when}: centre of mass {self.height:.2f} m high, tilt {self.tilt:.2f} rad; "
+            f"likeliest cause: {self.cause}"
         )
+
+
+class Fault(NamedTuple):
+    """What may go wrong at some time of a walk."""
+
+    text: str
+    when: Bool[np.ndarray, " n"]
+    remedy: str
 
 
 def record_walk(config: WalkConfig, robot: Robot, job: Job) -> Record:
@@ -71,6 +90,7 @@ def record_walk(config: WalkConfig, robot: Robot, job: Job) -> Record:
     """
     rows, touching = [], []
     min_height, max_tilt = robot.description.limits
+    feet = job.body(robot).description.named_feet
 
     def append(world: World, data: mujoco.MjData) -> None:
         if rows and rows[-1][-1]:
@@ -79,61 +99,112 @@ def record_walk(config: WalkConfig, robot: Robot, job: Job) -> Record:
         roll, pitch = np.arctan2(up[1], up[2]), -np.arcsin(np.clip(up[0], -1.0, 1.0))
         height = data.qpos[2] + up @ robot.com_offset
         torque = data.ctrl / world.model.actuator_ctrlrange[:, 1]
-        touching[:] = _on_floor(world, data)
+        *contacts, touching[:] = _contacts(world, data, len(feet))
+        soles = [_tilt_of(np.array([data.geom(name).xpos for name in f.contacts])) for f in feet]
         # false for values that are not finite
         upright = height >= min_height and max(abs(roll), abs(pitch)) <= max_tilt
-        rows.append((height, roll, pitch, torque, bool(touching) or not upright))
+        fallen = bool(touching) or not upright
+        rows.append((height, (roll, pitch), torque, *contacts, soles, fallen))
 
     trajectory = walk(config, robot, job, build=partial(MujocoPlant, on_step=append))
-    heights, rolls, pitches, torques, fallen = zip(*rows, strict=True)
+    columns = map(np.array, zip(*rows, strict=True))
+    height, angles, torque, force, use, legs_touch, sole, fallen = columns
     lead = (job.start_tick - first_tick(config)) * substeps(config)
     return Record(
         time=TIME_STEP * (1 + np.arange(len(rows)) - lead),
-        height=np.array(heights),
-        angles=np.stack([rolls, pitches], axis=1),
-        torque=np.array(torques),
+        height=height,
+        angles=angles,
+        torque=torque,
+        load=force / float(robot.mass * robot.gravity[2]),
+        friction=use,
+        sole=sole,
+        legs_touch=legs_touch,
         touching=", ".join(touching),
-        fallen=fallen[-1],
+        fallen=bool(fallen[-1]),
         trajectory=trajectory,
     )
 
 
-def _on_floor(world: World, data: mujoco.MjData) -> list[str]:
-    """Return the names of geoms, or of their bodies, that touch the floor and are of no foot."""
-    names = set()
-    for first, second in data.contact.geom[: data.ncon]:
-        geom = second if first == world.floor else first
-        if world.floor in (first, second) and world.foot_of_geom[geom] < 0:
-            part = world.model.geom(geom)
+def _contacts(
+    world: World, data: mujoco.MjData, feet: int
+) -> tuple[Float[np.ndarray, " feet"], Float[np.ndarray, " feet"], bool, list[str]]:
+    """Return what touches in a millisecond.
+
+    Returns:
+        Force [N] of the floor on each foot; the share of its friction in use; whether legs touch;
+        names of geoms, or of their bodies, that touch the floor and are of no foot.
+    """
+    force, used, legs_touch, names, local = *np.zeros((2, feet)), False, set(), np.zeros(6)
+    for i, contact in enumerate(data.contact):
+        geom = contact.geom[contact.geom != world.floor][0]
+        foot, part = world.foot_of_geom[geom], world.model.geom(geom)
+        if world.floor not in contact.geom:
+            legs_touch = True
+        elif foot < 0:
             names.add(part.name or world.model.body(part.bodyid[0]).name)
-    return sorted(names)
+        else:
+            mujoco.mj_contactForce(world.model, data, i, local)
+            force[foot] += local[0]
+            used[foot] += np.abs(local[1:3]).sum() / contact.friction[0]
+    return force, used / np.maximum(force, 1e-9), legs_touch, sorted(names)
 
 
-def at_limit(robot: Robot, torque: Float[np.ndarray, "n joints"], most: float) -> list[str]:
-    """Return a line for each motor that is at its limit for a share of the time above `most`."""
-    shares = (np.abs(torque) >= AT_LIMIT).mean(axis=0) if len(torque) else np.zeros(0)
-    names = robot.description.joints
+def _tilt_of(points: Float[np.ndarray, "c 3"]) -> float:
+    """Return the steepest slope [rad] from the lowest of the points to another; zero for one."""
+    above = points - points[np.argmin(points[:, 2])]
+    slopes = np.arctan2(above[:, 2], np.linalg.norm(above[:, :2], axis=1))
+    return float(slopes.max())
+
+
+def _motors(robot: Robot, torque: Float[np.ndarray, "n joints"]) -> Iterator[Fault]:
+    remedy = "a slower trajectory, another gait, or a larger limit"
+    named = zip(robot.description.joints, robot.torque_limit, torque.T, strict=True)
+    for name, limit, share in named:
+        text = f"the torque of {name} is at its limit of {limit:g} N m"
+        yield Fault(text, np.abs(share) >= AT_LIMIT, remedy)
+
+
+def _feet(robot: Robot, record: Record) -> Iterator[Fault]:
+    names, loaded = robot.description.legs, record.load >= LOADED
+    slower = "a slower trajectory or another gait"
+    tilted, slips = loaded & (record.sole >= TILTED), loaded & (record.friction >= AT_LIMIT)
+    for name, tilts, slides in zip(names, tilted.T, slips.T, strict=True):
+        foot = f"the {name.replace('_', ' ')} foot"
+        text = f"{foot} stands on an edge of its sole, tilted by {TILTED:g} rad or more,"
+        yield Fault(text, tilts, f"{slower}; contacts of the sole in [feet]")
+        text = f"{foot} slips, at the limit of the floor's friction,"
+        yield Fault(text, slides, f"{slower}; a smaller friction in [mpc]")
+    remedy = "a larger width in [footstep], or a slower trajectory"
+    yield Fault("the legs touch each other", record.legs_touch, remedy)
+
+
+def _lasting(
+    faults: Iterable[Fault], rows: slice | Bool[np.ndarray, " n"], most: float, span: str
+) -> list[str]:
+    """Return a line for each fault in a share of the rows above `most`, the longest first."""
+    shares = [(np.sum(fault.when[rows]) / max(len(fault.when[rows]), 1), fault) for fault in faults]
+    shares.sort(key=lambda pair: -pair[0])
     return [
-        f"the torque of {names[i]} is at its limit of {robot.torque_limit[i]:g} N m for "
-        f"{100 * shares[i]:.0f} % of the time"
-        for i in np.argsort(-shares, kind="stable")
-        if shares[i] > most
+        f"{text} for {100 * share:.0f} % of {span} (try {remedy})"
+        for share, (text, _, remedy) in shares
+        if share > most
     ]
 
 
-def startup_fall(config: WalkConfig, robot: Robot, job: Job) -> StartupFall | None:
-    """Return time, pose and cause of a robot's fall before t = 0; None if it does not fall.
+def fall_of(config: WalkConfig, robot: Robot, job: Job) -> Fall | None:
+    """Return time, pose and cause of a robot's fall; None if it does not fall.
 
     Args:
         config, robot, job: as for `walk`.
     """
-    record = record_walk(config, robot, job._replace(seconds=config.gait.tick))
-    if not np.asarray(record.trajectory.fallen)[0]:
+    record = record_walk(config, robot, job)
+    if not (fallen := np.asarray(record.trajectory.fallen)).any():
         return None
     finite = np.flatnonzero(np.isfinite(record.height) & np.isfinite(record.tilt))
     last = finite[-1] if len(finite) else 0
-    return StartupFall(
-        time=min(float(record.time[-1]), 0.0),
+    upright = float(record.trajectory.period * np.sum(~fallen))
+    return Fall(
+        time=upright or min(float(record.time[-1]), 0.0),
         height=float(record.height[last]),
         tilt=float(record.tilt[last]),
         cause=likeliest_cause(robot, record),
@@ -141,32 +212,44 @@ def startup_fall(config: WalkConfig, robot: Robot, job: Job) -> StartupFall | No
 
 
 def likeliest_cause(robot: Robot, record: Record) -> str:
-    """Return the likeliest cause of a fall, from the record before the robot was half over."""
+    """Return the likeliest cause of a fall and what to change.
+
+    It is what lasts longest in the second before the robot is half over: motors at their limits, a
+    foot on an edge or slipping, legs that touch. A plan that is not solved comes first.
+    """
     if not record.fallen or not np.isfinite(record.height[-1]):
         return "the physics diverges (joint gains too large, masses or inertias too small)"
-    if not np.max(record.trajectory.residual) <= SOLVED:
-        return "a QP of the MPC is not solved"
+    walk = record.trajectory
+    recent = np.sum(walk.fallen) + round(BEFORE_FALL / float(walk.period))
+    if not (worst := np.max(walk.residual[-recent:])) <= SOLVED:
+        return f"a QP of the MPC is not solved, residual {worst:.0e} (try other weights or [mpc])"
     min_height, max_tilt = robot.description.limits
     standing = float(robot.standing_height)
     over = (record.tilt > 0.5 * max_tilt) | (record.height < 0.5 * (standing + min_height))
     count = max(int(np.argmax(over)) if over.any() else len(over), 1)
-    if lines := at_limit(robot, record.torque[:count], MOST_BEFORE_FALL):
+    rows = slice(max(count - round(BEFORE_FALL / TIME_STEP), 0), count)
+    span = f"the {TIME_STEP * (count - rows.start):.2g} s before it"
+    faults = *_motors(robot, record.torque), *_feet(robot, record)
+    if lines := _lasting(faults, rows, MOST_BEFORE_FALL, span):
         return lines[0]
-    error = record.height[:count] - standing
-    if _grows(error, record.tilt[:count] / max_tilt):
+    error = record.height[rows] - standing
+    if _grows(error, record.tilt[rows] / max_tilt):
         motion = "sinks" if error[-1] < 0.0 else "rises"
         return (
             f"the centre of mass {motion} steadily, by {100 * abs(error[-1]):.0f} cm while still "
-            "upright (the feet do not reach the floor as planned, joint gains or mass are wrong)"
+            "upright: the feet do not reach the floor as planned (try other kp, correct the mass)"
         )
     if record.touching and record.tilt[-1] <= max_tilt and record.height[-1] >= min_height:
-        return f"{record.touching} touches the floor"
+        return f"{record.touching} touches the floor (try another standing pose, or larger kp)"
     roll, pitch = record.angles[-1]
     if abs(roll) > abs(pitch):
         direction = "to the right" if roll > 0.0 else "to the left"
     else:
         direction = "forwards" if pitch > 0.0 else "backwards"
-    return f"it tips over {direction} (standing pose, joint gains, gait)"
+    return (
+        f"it tips over {direction} (try a slower trajectory, other weights, gait, kp, or another "
+        "standing pose)"
+    )
 
 
 def _grows(error: Float[np.ndarray, " n"], tilt: Float[np.ndarray, " n"]) -> bool:
@@ -199,16 +282,14 @@ def _steady_height(trajectory: Trajectory, rows: Bool[np.ndarray, " T"]) -> list
 def not_the_weights(config: WalkConfig, robot: Robot, job: Job) -> list[str]:
     """Return a line for each fault of a walk that is likely not due to the weights; mostly none.
 
-    Faults are a fall in the start-up, or a height with a steady error and motors at their limits.
+    Faults are a height with a steady error, and motors at their limits.
 
     Args:
         config, robot, job: as for `walk`.
     """
     record = record_walk(config, robot, job)
-    if np.asarray(record.trajectory.fallen)[0]:
-        return [str(startup_fall(config, robot, job))]
     end = record.time[-1] - FALLING * record.fallen
     time = float(record.trajectory.period) * np.arange(1, len(record.trajectory.fallen) + 1)
-    upright = (time > SETTLED) & (time <= end)
-    torque = record.torque[record.time <= end]
-    return [*_steady_height(record.trajectory, upright), *at_limit(robot, torque, MOST_AT_LIMIT)]
+    upright, motors = (time > SETTLED) & (time <= end), _motors(robot, record.torque)
+    lines = _lasting(motors, record.time <= end, MOST_AT_LIMIT, "the time")
+    return [*_steady_height(record.trajectory, upright), *lines]

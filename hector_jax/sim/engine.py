@@ -46,7 +46,7 @@ class Engine(NamedTuple):
     modules: tuple[str, ...] = ("sim.walk",)  # modules of this package that decide its numbers
     package: str = "mujoco"  # its Python package; the extra with the engine's name installs it
     # differences of its plants from MuJoCo C, for reports; empty means the same physics, and a walk
-    # that falls in the start-up is then diagnosed in MuJoCo C
+    # that falls is then diagnosed in MuJoCo C
     differs: str = ""
 
     @property

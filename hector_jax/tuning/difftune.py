@@ -371,10 +371,18 @@ def single(tuning: Tuning) -> Tuning:
     found = jax.tree.map(np.asarray, tuning)
     count = 1 + int(np.max(found.history.iteration))
     found = found._replace(history=jax.tree.map(lambda x: x[:count], found.history))
-    if found.stop == Stop.BAD_START:
-        reason = found.iterations[0].reason
-        raise InputError(f"the starting weights cannot be tuned from: {reason}")
+    start = found.iterations[0]
+    check_start(StepStatus(int(start.status)), start.evaluation)
     return found
+
+
+def check_start(status: StepStatus, evaluation: Evaluation) -> None:
+    """Raise an InputError with the reason if the start of a tuning is rejected."""
+    if reason := status_text(status, evaluation):
+        raise InputError(
+            f"the starting weights cannot be tuned from: {reason} (try a slower or "
+            "shorter trajectory, another gait, or other weights as the start)"
+        )
 
 
 def needs_matrix(config: TuneConfig, state: TuneState, evaluation: Evaluation) -> Any:
