@@ -26,7 +26,7 @@ from hector_jax.robot.response import (
     swing_frequency,
     trunk_gain,
 )
-from hector_jax.sim.margin import Loops, _plan_gain, delay_margin, loops, modes, report
+from hector_jax.sim.margin import Loops, _plan_gain, delay_lines, delay_margin, loops, modes
 from hector_jax.sim.world import MAX_DELAY
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -171,7 +171,7 @@ def test_a_delayed_joint_is_stable_up_to_its_phase_margin():
 def test_the_rules_of_the_gains_bear_the_delay_that_made_the_legs_cycle():
     config, weights = walk_config(QUADRUPED), nominal(QUADRUPED)
     assert delay_margin(QUADRUPED, config, weights) == (MAX_DELAY, None)
-    assert report(QUADRUPED, config, weights) == [
+    assert delay_lines(QUADRUPED, config, weights) == [
         "stable up to 8 ms of the motors, with a lag of 6 ms"
     ]
     # w = 30 rad/s and the inertia of the whole robot, as robots were proposed before
@@ -180,7 +180,7 @@ def test_the_rules_of_the_gains_bear_the_delay_that_made_the_legs_cycle():
     found = delay_margin(QUADRUPED, stiff, weights)
     assert found.delay == pytest.approx(0.003)
     assert found.frequency == pytest.approx(21.0, abs=2.0)  # in MuJoCo the cycle has 20 Hz
-    first, remedy = report(QUADRUPED, stiff, weights)
+    first, remedy = delay_lines(QUADRUPED, stiff, weights)
     assert first.startswith("stable up to 3 ms of the motors, with a lag of 6 ms; later, it shakes")
     assert remedy.startswith("for 8 ms set mpc.inertia = [0.47, 1.0, 1.0], legs.kp = [")
 

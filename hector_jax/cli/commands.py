@@ -176,7 +176,7 @@ def _print_robot(robot: Robot, wrong: Sequence[str]) -> None:
     """Print a robot's data, after checking that the controller and the loss can read it."""
     config = walk_config(robot)
     loss_of_robot(robot.description)
-    wrong, delay = [*wrong, *remarks(robot)], margin.report(robot, config, nominal(robot))
+    wrong, delay = [*wrong, *remarks(robot)], margin.delay_lines(robot, config, nominal(robot))
     lists = {"delay": delay, "mended": changes(robot), "wrong": wrong}
     lines = [line for title, found in lists.items() for line in _list(title, found)]
     print("\n".join([*table_of(robot), *lines]))

@@ -211,7 +211,7 @@ def _short(x: float) -> float:
     return float(f"{x:.3g}")
 
 
-def report(robot: Robot, config: WalkConfig, weights: Weights) -> list[str]:
+def delay_lines(robot: Robot, config: WalkConfig, weights: Weights) -> list[str]:
     """Return the lines about the delay of the motors that the loops bear, and how to bear more."""
     bears, frequency = delay_margin(robot, config, weights)
     motors = f"of the motors, with a lag of {1e3 * LAG:g} ms"
