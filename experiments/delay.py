@@ -24,7 +24,7 @@ from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import nominal
 from hector_jax.core.console import exit_code, say
 from hector_jax.core.files import make_folder
-from hector_jax.core.inputs import InputError
+from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, Range, check
 from hector_jax.report.report import markdown_table
@@ -171,7 +171,7 @@ def main() -> None:
                 tables += [f"## {name}, {command}", markdown_table(head, rows)]
     about = (
         f"L (L_ctrl) in 1e6 of the nominal weights on the hfs, by delay and lag of the motors, "
-        f"with the white noise of the stand-in's estimate; the median of {flags.seeds} seeds."
+        f"with the white noise of the stand-in's estimate; the median of {plural(flags.seeds, 'seed')}."
     )
     numbers = {"walks": walks, "delays": list(flags.delays), "lags": list(flags.lags)}
     numbers |= {"root_locus": loci, "root_locus_delays": (1e3 * LOCUS).tolist()}
