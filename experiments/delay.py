@@ -171,11 +171,13 @@ def main() -> None:
                 tables += [f"## {name}, {command}", markdown_table(head, rows)]
     about = (
         f"L (L_ctrl) in 1e6 of the nominal weights on the hfs, by delay and lag of the motors, "
-        f"with the white noise of the stand-in's estimate; the median of {plural(flags.seeds, 'seed')}."
+        f"with the white noise of the stand-in's estimate; the median of "
+        f"{plural(flags.seeds, 'seed')}."
     )
     numbers = {"walks": walks, "delays": list(flags.delays), "lags": list(flags.lags)}
     numbers |= {"root_locus": loci, "root_locus_delays": (1e3 * LOCUS).tolist()}
-    path, title = flags.out / "report.md", "Delay of the motors"
+    what = ", ".join([*walks, *flags.traj])
+    path, title = flags.out / "report.md", f"Delay of the motors: {what}"
     report = {"numbers": numbers, "json_name": "delay.json", "pictures": pictures}
     print(write_report(path, title, [about, *tables], **report))
 
