@@ -360,3 +360,33 @@ def ranks(
         setp(panels[-1], xlabel="L on the hfs [10$^6$]")
         setp(panels[:, 0].tolist(), ylabel="L on the model [10$^6$]")
     return "Loss of disturbed weight sets, model against hfs; the numbers are rank correlations."
+
+
+def root_locus(
+    path: Path,
+    delays: Sequence[float] | Float[np.ndarray, " delays"],
+    loci: Mapping[str, Sequence[Sequence[tuple[float, float]]]],
+) -> str:
+    """Draw growth and frequency of the modes of loops, by the delay of the motors.
+
+    Args:
+        path: file to write.
+        delays: [ms].
+        loci: by controller, for each delay the growth [1/s] and the frequency [Hz] of the modes.
+    """
+    looks = zip(loci.items(), ((style.ORANGE, "s"), (style.GREEN, "o")), strict=False)
+    with drawing(path, 6.0, 3.6) as figure:
+        axes = figure.subplots()
+        for (name, by_delay), (color, marker) in looks:
+            for i, modes in enumerate(by_delay):
+                size = 2.0 + 5.0 * i / (len(delays) - 1)  # larger with more delay
+                look: Any = {"color": color, "marker": marker, "markersize": size, "ls": "none"}
+                label = name if i == len(by_delay) - 1 else None
+                growth, frequency = np.reshape(modes, (-1, 2)).T
+                axes.plot(growth, frequency, alpha=0.7, label=label, **look)
+        axes.axvline(0.0, color="black", linewidth=0.8)
+        axes.set(xlabel="growth [1/s]", ylabel="frequency [Hz]", xlim=(-40, 25), ylim=(0, 35))
+    return (
+        f"Modes of trunk, legs and plan with motors from {delays[0]:g} (small marks) to "
+        f"{delays[-1]:g} ms late: those right of the line grow into a limit cycle."
+    )

@@ -24,6 +24,7 @@ from hector_jax.robot.description import (
 )
 from hector_jax.robot.model import compile_model, robot_of
 from hector_jax.robot.propose import HEIGHT, MASS, as_toml, propose, size_of
+from hector_jax.robot.response import response, swing_frequency
 from hector_jax.robot.soles import find_soles
 from hector_jax.robot.survey import survey_file
 from hector_jax.robot.table import remarks
@@ -179,7 +180,9 @@ def test_gains_follow_from_what_hangs_at_a_joint(humanoid):
     I = size_of(description, robot).inertia[: description.leg_joints]  # noqa: E741
     kp, kd = np.array(config.legs.kp), np.array(config.legs.kd)
     most = 2.0 * robot.torque_limit[: description.leg_joints]
-    np.testing.assert_allclose(kp, np.minimum(900.0 * I, most), rtol=6e-3)
+    w = swing_frequency(response(robot))
+    assert 10.0 < w < 30.0
+    np.testing.assert_allclose(kp, np.minimum(w**2 * I, most), rtol=6e-3)
     np.testing.assert_allclose(kd, np.sqrt(kp * I), rtol=1e-2)
     assert config.legs.gravity_compensation
 

@@ -20,11 +20,15 @@ from hector_jax.sim.world import (
     build_worlds,
     hfs,
     hfs_drawn,
+    hfs_even,
     hfs_varied,
+    hfs_with_motors,
     ideal,
     named_world,
+    noisy,
     push_force,
     standing_qpos,
+    truth,
 )
 
 ROBOT = load_robot()
@@ -219,6 +223,28 @@ def test_drawn_plants_stay_within_their_share():
             assert not any(np.any(x) for x in plant.estimator)
 
 
+def test_plants_with_motors_have_those_of_robots_and_else_are_as_drawn():
+    plants = [hfs_with_motors(seed, 0.4) for seed in range(60)]
+    for name, (low, high) in (("delay", (0.001, 0.005)), ("lag", (0.002, 0.006))):
+        values = np.array([getattr(plant, name) for plant in plants])
+        assert low <= values.min() < low + 0.0005
+        assert high - 0.0005 < values.max() <= high
+    for seed in (0, 1):
+        motors = {"delay": plants[seed].delay, "lag": plants[seed].lag}
+        same = jax.tree.map(np.array_equal, plants[seed], hfs_varied(seed)._replace(**motors))
+        assert all(jax.tree.leaves(same))
+
+
+def test_the_plants_of_hfs_even_have_masses_about_the_nominal_ones_and_a_noisy_estimate():
+    plants = [hfs_even(seed) for seed in range(60)]
+    masses = np.array([plant.mass for plant in plants])
+    assert 0.85 <= masses.min() < 0.87 < 1.13 < masses.max() <= 1.15
+    others = {"mass": np.asarray(1.0), "estimator": truth()}
+    rest = [p._replace(**others) for p in (plants[3], hfs_with_motors(3, 0.4))]
+    assert all(jax.tree.leaves(jax.tree.map(np.array_equal, *rest)))
+    assert plants[3].estimator == noisy()
+
+
 def test_standin_plants_stay_within_their_table():
     low = dict(joint_friction=0.3, joint_damping=0.1, armature=0.9, backlash=0.005, delay=0.001)
     low |= dict(lag=0.002, linkage=0.3, contact_time=0.006, floor_friction=0.65, mass=0.95)
@@ -236,7 +262,7 @@ def test_standin_plants_stay_within_their_table():
 
 
 def test_a_seed_is_a_plant():
-    for draw in (hfs_drawn, hfs_varied, standin):
+    for draw in (hfs_drawn, hfs_varied, hfs_with_motors, hfs_even, standin):
         same = [np.concatenate([np.ravel(x) for x in jax.tree.leaves(draw(s))]) for s in (3, 3, 4)]
         np.testing.assert_array_equal(same[0], same[1])
         assert (same[0] != same[2]).any()
@@ -257,7 +283,8 @@ def test_a_wrong_number_is_refused_by_name():
 
 
 def test_an_unknown_world_is_refused():
-    with pytest.raises(ValueError, match="unknown world 'mars'; known: ideal, hfs, hfs-varied"):
+    known = "ideal, hfs, hfs-varied, hfs-even"
+    with pytest.raises(ValueError, match=f"unknown world 'mars'; known: {known}"):
         named_world("mars")
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from hector_jax.cli import arguments, doctor, evaluate, flags, propose, tune, verdict, view
 from hector_jax.cli.arguments import print_result
 from hector_jax.control.controller import walk_config
-from hector_jax.control.weights import expert
+from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.console import say
 from hector_jax.core.environment import versions
@@ -26,6 +26,7 @@ from hector_jax.runs import export, nets, searches, tunings
 from hector_jax.runs.folder import RESULT, load_run, read_request
 from hector_jax.runs.setup import Setup
 from hector_jax.search.cmaes import SearchConfig
+from hector_jax.sim import margin
 from hector_jax.sim.engine import choose_engine
 from hector_jax.tuning.loss import alphas, loss_of_robot
 
@@ -173,10 +174,12 @@ def examine_robot(args: flags.Robot) -> None:
 
 def _print_robot(robot: Robot, wrong: Sequence[str]) -> None:
     """Print a robot's data, after checking that the controller and the loss can read it."""
-    walk_config(robot)
+    config = walk_config(robot)
     loss_of_robot(robot.description)
-    wrong = [*wrong, *remarks(robot)]
-    print("\n".join([*table_of(robot), *_list("mended", changes(robot)), *_list("wrong", wrong)]))
+    wrong, delay = [*wrong, *remarks(robot)], margin.delay_lines(robot, config, nominal(robot))
+    lists = {"delay": delay, "mended": changes(robot), "wrong": wrong}
+    lines = [line for title, found in lists.items() for line in _list(title, found)]
+    print("\n".join([*table_of(robot), *lines]))
 
 
 def _list(title: str, lines: Sequence[str]) -> list[str]:

@@ -40,9 +40,9 @@ from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance, Integral
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array, contract
 from hector_jax.core.geometry import rot_z
-from hector_jax.core.inputs import InputError
+from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.part import choose_part
-from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SHARE, check
+from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SHARE, Range, check
 from hector_jax.core.trajectory import State, Wrench, pack_wrench, unpack_wrench
 from hector_jax.qp import QP, QpConfig, Solution, block_diagonal, solve_qp
 from hector_jax.robot import srbm
@@ -70,6 +70,8 @@ class MpcConfig:
     max_force: Annotated[float, POSITIVE] = 500.0  # [N] per foot
     # share of a flat sole's half width that the plan uses
     sole_width: Annotated[float, SHARE] = 1.0
+    # shares of the robot's inertia about the trunk's x, y and z with which the plan turns it
+    inertia: tuple[float, ...] = (1.0, 1.0, 1.0)
     line_friction: bool = True  # False removes LINE_FRICTION from the constraints
     effort_reference: str = "zero"  # cost on u (paper); "gravity": on u minus the weight's share
     position_limit: float | None = None  # [m] largest horizontal error that counts; None: any
@@ -83,7 +85,10 @@ class MpcConfig:
     constraints: tuple[str, ...] | None = None  # Constraints or names; None: the contact model's
 
     def __post_init__(self) -> None:
-        check(self, position_limit=POSITIVE, effort_reference=("zero", "gravity"))
+        share, words = Range(0.0, 1.0, above=True), ("zero", "gravity")
+        check(self, position_limit=POSITIVE, effort_reference=words, inertia=share)
+        if len(self.inertia) != 3:
+            raise InputError(f"MpcConfig.inertia must be 3 numbers, got {short_repr(self.inertia)}")
         model = choose_part("MpcConfig.contact", self.contact, ContactModel, CONTACT_MODELS)
         chosen = [
             choose_part("MpcConfig.constraints", constraint, Constraint, CONSTRAINTS)
@@ -106,6 +111,13 @@ class MpcConfig:
             position_limit=math.inf if self.position_limit is None else self.position_limit,
             integral=gains,
         )
+
+    def planned_inertia(self, inertia: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+        """Return the inertia [kg m^2] that the plan turns, from that of the whole robot."""
+        if self.inertia == (1.0, 1.0, 1.0):
+            return inertia
+        root = np.sqrt(self.inertia)
+        return inertia * np.outer(root, root)
 
     @property
     def contact_model(self) -> ContactModel:
@@ -205,6 +217,7 @@ def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: in
     N, (robot, parameters, state, horizon, disturbance) = config.horizon, problem
     data = parameters.weights, state, horizon.lever
     dtype = jnp.result_type(*jax.tree.leaves(data), jnp.float32)
+    robot = robot._replace(inertia=config.planned_inertia(robot.inertia))
     A, B = jax.vmap(lambda e, r: srbm.linearise(robot, e, r, dt))(horizon.euler, horizon.lever)
     feet = jax.vmap(lambda c: feet_of_contacts(c.astype(dtype), max_contacts))(horizon.contact)
     G = jax.vmap(partial(_input_map, config.contact_model))(feet, horizon.foot_yaw)

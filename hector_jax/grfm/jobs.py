@@ -10,7 +10,7 @@ from hector_jax.control.weights import Weights, between, expert, nominal
 from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import Robot
 from hector_jax.sim.loop import Job
-from hector_jax.sim.world import Push, hfs_drawn
+from hector_jax.sim.world import Push, hfs_with_motors
 
 KINDS = (*COMMANDS, "random")  # of commands; job i is of kind i modulo their number
 SPREAD = 3.0  # weights are drawn log-uniformly within x/SPREAD of their centre
@@ -61,7 +61,7 @@ def draw_jobs(
         else:
             draw_one = lambda w: w * SPREAD ** rng.uniform(-1.0, 1.0, w.shape)  # noqa: E731
             weights = jax.tree.map(draw_one, centres[centre])
-        plant = hfs_drawn(int(rng.integers(2**31)), description=description)
+        plant = hfs_with_motors(int(rng.integers(2**31)), description=description)
         push = _draw_push(rng, seconds, description.plants.push)
         return Job(weights, command, plant, seconds, seed=i, push=push)
 

@@ -13,9 +13,11 @@ of mass m and height h:
     width                    0.85 (four feet: 0.7) of half the distance of the foot points, standing
     feedback                 0.12 s sqrt(h / h0)
     height                   0.06 m h / 0.69 m for the swing foot; landing -0.005 m
-    kp                       I w^2 with w = 30 rad/s and I the inertia at the joint with its motor;
-                             at most 2 / rad times the torque limit
+    kp                       I w^2 with I the inertia at the joint with its motor and w the largest
+                             with which slow motors leave the joints a phase margin of 30 degrees
+                             (`response`); at most 2 / rad times the torque limit
     kd                       sqrt(kp I)
+    mpc.inertia              that share which leaves the plan's attitude the same phase margin
     Q                        HECTOR's
     R of forces, moments     times (m0 / m)^2, (m0 h0 / (m h))^2; for nominal times 0.3 as well
     L_ctrl                   times (m0 / m)^2
@@ -44,12 +46,20 @@ from hector_jax.robot.checks import standing_data
 from hector_jax.robot.description import Description, description_of
 from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.model import Robot, compile_model, robot_of
+from hector_jax.robot.response import (
+    Response,
+    planned_inertia,
+    response,
+    swing_frequency,
+    trunk_gain,
+)
 from hector_jax.robot.soles import Sole, find_soles
 from hector_jax.robot.stand import standing_pose
 from hector_jax.robot.survey import Survey, survey_file
 
 MASS, HEIGHT = 12.0, 0.423  # of HECTOR [kg], [m]
-_SWING_FREQUENCY = 30.0  # of the joint control of a swing leg [rad/s]
+_TICK = 0.01  # [s] of the gait
+_ANGLE, _RATE = 50, 1  # weights Q of attitude and angular velocity
 _KP_PER_LIMIT = 2.0  # [1/rad]
 _ARMATURE_PER_LIMIT = 2e-4  # [s^2]: HECTOR's has 2.4e-4, Unitree's robots 1e-4 to 4e-4
 _COLUMNS = 100
@@ -140,14 +150,16 @@ def _settings(size: Size) -> dict[str, Any]:
     foot_y = foot_poses(robot, jnp.asarray(robot.standing_joints)).position[:, 1]
     four = len(foot_y) == 4
     flat = robot.structure.contact == "flat"
+    step_ticks, answer = max(3, math.ceil(0.15 * ticks)), response(robot)
     return {
         "limits": {"min_height": round(0.55 * height, 2)},
         "gait": ({"pattern": "trot"} if four else {}) | {"stance": ticks, "swing": ticks},
         "mpc": {
-            "step_ticks": max(3, math.ceil(0.15 * ticks)),
+            "step_ticks": step_ticks,
             "max_force": float(f"{2.5 * weight:.2g}"),
             "effort_reference": "gravity",
             **({"sole_width": 0.6} if flat else {}),
+            "inertia": _inertia(robot, answer, _TICK * step_ticks),
         },
         "footstep": {
             "width": round((0.7 if four else 0.85) * float(np.abs(foot_y).mean()), 3),
@@ -156,7 +168,7 @@ def _settings(size: Size) -> dict[str, Any]:
         "legs": {
             "height": round(0.06 * height / 0.69, 3),
             "landing": -0.005,
-            **_gains(size),
+            **_gains(size, answer),
             "gravity_compensation": True,
         },
         "weights": _weights(size),
@@ -187,22 +199,29 @@ def _armature(survey: Survey, robot: Robot) -> list[float] | None:
     return None if complete else [_short(x) for x in np.where(armature, armature, default)]
 
 
-def _gains(size: Size) -> dict[str, list[float]]:
+def _inertia(robot: Robot, answer: Response, step: float) -> list[float]:
+    """Return the shares of the inertia with which an MPC of a step [s] plans."""
+    gain = trunk_gain(robot, answer)
+    shares = planned_inertia(gain, angle=_ANGLE, rate=_RATE, step=step, tick=_TICK)
+    return [round(float(share), 2) for share in shares]
+
+
+def _gains(size: Size, answer: Response) -> dict[str, list[float]]:
     """Return the gains of a leg's joints from the mean inertia and least torque of all legs."""
     legs = len(size.robot.foot_point)
     inertia = size.inertia.reshape(legs, -1).mean(axis=0)
     limit = size.robot.torque_limit.reshape(legs, -1).min(axis=0)
-    kp = np.minimum(inertia * _SWING_FREQUENCY**2, _KP_PER_LIMIT * limit)
+    kp = np.minimum(inertia * swing_frequency(answer) ** 2, _KP_PER_LIMIT * limit)
     return {"kp": [_short(x) for x in kp], "kd": [_short(x) for x in np.sqrt(kp * inertia)]}
 
 
 def _weights(size: Size) -> dict[str, Any]:
     """Return HECTOR's Q, and R scaled by the squares of mass and of mass times height."""
     force, moment = size.mass**-2, (size.mass * size.height) ** -2
-    rates = {"ang_velocity": 1, "velocity": 1}
+    rates = {"ang_velocity": _RATE, "velocity": 1}
     return {
         "nominal": {
-            "euler": 50,
+            "euler": _ANGLE,
             "position": [50, 50, 250],
             **rates,
             "force": _short(0.3e-4 * force),

@@ -26,7 +26,7 @@ from hector_jax.core.inputs import plural
 from hector_jax.robot.model import Robot
 from hector_jax.runs import verdicts
 from hector_jax.runs.setup import Setup
-from hector_jax.sim.world import ESTIMATE_NOISE, Imperfections, hfs_drawn, truth
+from hector_jax.sim.world import Imperfections, hfs_with_motors, noisy
 from hector_jax.tuning.difftune import Tuning
 
 # fractions of the accepted iterations at which a path is walked
@@ -37,8 +37,9 @@ the centre of mass (8 cm for HECTOR); width and velocity feedback of the steps a
 controller's."""
 HELD_OUT = 8
 """Number of the plants of `earliest`."""
-# first seed of the plants of `choose`, `answer` and a tuning on walks, drawn like `hfs-varied` but
-# with other seeds; those of `earliest` have the seeds before it, so that none is among the former
+# first seed of the plants of `choose`, `answer` and a tuning on walks, drawn like those of hfs-even
+# but for the mass and with other seeds; those of `earliest` have the seeds before it, so that none
+# is among the former
 _FIRST_SEED = 7000
 
 
@@ -52,9 +53,8 @@ class Choice(NamedTuple):
 
 def drawn_plants(robot: Robot, count: int, first_seed: int = _FIRST_SEED) -> list[Imperfections]:
     """Return plants drawn around the hfs; by default the first of `choose` and tuning on walks."""
-    noisy = truth()._replace(**{name: np.asarray(sigma) for name, sigma in ESTIMATE_NOISE.items()})
     return [
-        hfs_drawn(seed, 0.4, robot.description)._replace(estimator=noisy)
+        hfs_with_motors(seed, 0.4, robot.description)._replace(estimator=noisy())
         for seed in range(first_seed, first_seed + count)
     ]
 

@@ -29,6 +29,7 @@ from hector_jax.robot.model import build_model, quiet_mujoco
 
 LINE_SEARCH = 50  # of the solver, steps; with 10 the hfs is off by 0.02 rad/s in 1 of 400 steps
 MAX_DELAY = 0.008  # [s] that the motors' memory can hold
+MOTOR_DELAY, MOTOR_LAG = (0.001, 0.005), (0.002, 0.006)  # [s] of the motors that robots have
 SLACK = "_backlash"  # suffix of the names of backlash joints
 SLACK_DAMPING = 0.01  # [N m s/rad] of a backlash joint
 STOP_TIME = 0.004  # [s] solref of the backlash's end stops: gear teeth are hard
@@ -99,6 +100,11 @@ def truth() -> Estimator:
     return Estimator(*(np.zeros(()) for _ in Estimator._fields))
 
 
+def noisy() -> Estimator:
+    """Return an estimator with the white noise of a real robot's, `ESTIMATE_NOISE`."""
+    return truth()._replace(**{name: np.asarray(sigma) for name, sigma in ESTIMATE_NOISE.items()})
+
+
 def ideal(description: Description = HECTOR) -> Imperfections:
     """Return an ideal plant to check the controller: firm ground, joint damping 0.1, nothing else.
 
@@ -146,7 +152,7 @@ def hfs_drawn(seed: int, share: float = 0.2, description: Description = HECTOR) 
 
     Args:
         seed: number of the plant.
-        share: 0.2 for collection, 0.4 for `hfs-varied`.
+        share: 0.4 for `hfs-varied`.
         description: of the robot, HECTOR by default.
     """
     base, rng = hfs(description), np.random.default_rng([0x4F5, round(1000 * share), seed])
@@ -167,7 +173,31 @@ def hfs_varied(seed: int, description: Description = HECTOR) -> Imperfections:
     return hfs_drawn(seed, 0.4, description)
 
 
-WORLDS = ("ideal", "hfs", "hfs-varied")
+def hfs_with_motors(
+    seed: int, share: float = 0.2, description: Description = HECTOR
+) -> Imperfections:
+    """Draw a plant around the hfs with any of the motors that robots have, fast or slow.
+
+    Delay and lag are uniform in MOTOR_DELAY and MOTOR_LAG: a limit cycle of trunk and legs starts
+    at some delay, and nothing that was made on faster motors keeps away from it.
+
+    Args:
+        seed, share, description: of the other numbers, as for `hfs_drawn`; 0.2 for collection, 0.4
+            for choices.
+    """
+    rng = np.random.default_rng([0x4F6, round(1000 * share), seed])
+    delay, lag = (np.asarray(rng.uniform(*bounds)) for bounds in (MOTOR_DELAY, MOTOR_LAG))
+    return hfs_drawn(seed, share, description)._replace(delay=delay, lag=lag)
+
+
+def hfs_even(seed: int, description: Description = HECTOR) -> Imperfections:
+    """Draw a plant with any motors, a noisy estimate, and a mass evenly about the nominal one."""
+    mass = np.random.default_rng([0x4F7, seed]).uniform(0.85, 1.15)
+    plant = hfs_with_motors(seed, 0.4, description)
+    return plant._replace(mass=np.asarray(mass), estimator=noisy())
+
+
+WORLDS = ("ideal", "hfs", "hfs-varied", "hfs-even")
 
 
 def named_world(name: str, seed: int = 0, description: Description = HECTOR) -> Imperfections:
@@ -183,7 +213,8 @@ def named_world(name: str, seed: int = 0, description: Description = HECTOR) -> 
     """
     if name not in WORLDS:
         raise InputError(unknown("world", name, WORLDS))
-    worlds = {"ideal": ideal, "hfs": hfs, "hfs-varied": partial(hfs_varied, seed)}
+    drawn = {"hfs-varied": hfs_varied, "hfs-even": hfs_even}
+    worlds = {"ideal": ideal, "hfs": hfs, **{n: partial(draw, seed) for n, draw in drawn.items()}}
     return worlds[name](description=description)
 
 
