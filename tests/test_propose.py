@@ -136,6 +136,29 @@ def test_soles_of_meshes_are_asked_for(tmp_path):
     assert line.endswith("measure the sole and correct feet.left and feet.right")
 
 
+def test_wrenches_act_in_the_middle_of_a_sole_with_a_short_heel(tmp_path):
+    path = small(tmp_path).model
+    path.write_text(path.read_text().replace('pos="0.01 0 -0.03"', 'pos="0.05 0 -0.03"'))
+    proposal = propose(path)
+    assert proposal.wrong == ()
+    assert "point" not in proposal.table["feet"]["left"]
+    _, robot, _ = loaded(proposal)
+    np.testing.assert_allclose(robot.foot_point[:, 0], 0.05, atol=1e-4)
+    np.testing.assert_allclose([robot.toe, robot.heel], 0.06, atol=1e-4)
+    _, data = standing(robot)
+    points = [data.site(f"{side}_point").xpos[0] for side in ("left", "right")]
+    assert abs(data.subtree_com[1][0] - np.mean(points)) < 1e-3
+    assert not any("along -x" in line for line in remarks(robot))
+
+
+def test_a_sole_behind_the_ankle_is_told(tmp_path):
+    path = small(tmp_path).model
+    text = path.read_text().replace('pos="0.05 0 -0.03"', 'pos="-0.05 0 -0.03"')
+    path.write_text(text.replace('pos="0.01 0 -0.03"', 'pos="-0.01 0 -0.03"'))
+    _, robot, _ = loaded(propose(path))
+    assert any("along -x" in line for line in remarks(robot))
+
+
 def test_a_tilted_box_is_the_sole_and_is_level_standing(tmp_path):
     path = small(tmp_path).model
     text, box = path.read_text(), '<geom type="box" size="0.06 0.03 0.01" pos="0.01 0 -0.03"'

@@ -109,7 +109,7 @@ def by_numbers(folder, text, **changes):
     path.write_text(text)
     angles = {f"{s}_{j}": a for s in ("left", "right") for j, a in BEND.items()}
     feet = tuple(
-        Foot(None, ((0.09, 0.0, -0.04), (-0.06, 0.0, -0.04)), f"{side}_foot")
+        Foot((0.0, 0.0, -0.04), ((0.09, 0.0, -0.04), (-0.06, 0.0, -0.04)), f"{side}_foot")
         for side in ("left", "right")
     )
     return Description(

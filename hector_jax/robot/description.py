@@ -57,7 +57,7 @@ def _joint_names(side: str) -> tuple[str, ...]:
 class Foot(NamedTuple):
     """A foot in the model's file, by names in it or by points in the frame of a body."""
 
-    point: str | Triple | None  # site; or point where wrenches act [m]; None: under the last joint
+    point: str | Triple | None  # site; or point where wrenches act [m]; None: middle of contacts
     contacts: tuple[str | Triple, ...]  # spheres; or contact points of the sole [m]
     body: str | None = None  # whose frame the points are in
 

@@ -66,7 +66,7 @@ class Robot(NamedTuple):
     gravity: Float[np.ndarray, "3"]  # pointing up as in the paper [m/s^2]
     joint_origin: Float[np.ndarray, "feet j 3"]  # joint in the frame of the link above [m]
     joint_axis: Float[np.ndarray, "feet j 3"]  # in its own link's frame
-    foot_point: Float[np.ndarray, "feet 3"]  # on the sole under the ankle, in the last link [m]
+    foot_point: Float[np.ndarray, "feet 3"]  # where wrenches act on the sole, in the last link [m]
     sole: Float[np.ndarray, "feet 3 3"]  # takes vectors of a sole (x ahead, z up) to the last link
     link_mass: Float[np.ndarray, "feet j"]  # of the link that each joint moves [kg]
     link_com: Float[np.ndarray, "feet j 3"]  # its CoM in its own frame [m]

@@ -253,12 +253,8 @@ def _add_foot_by_points(
             duplicate.name = ""
         size = [CONTACT_RADIUS, 0.0, 0.0]
         body.add_geom(name=name, type=_SPHERE, size=size, pos=contact + up, **fields)
-    if foot.point is None:
-        level = contacts @ R.T  # world axes, origin at the last joint
-        middle = 0.5 * (level.min(axis=0) + level.max(axis=0))
-        point = R.T @ np.array([0.0 if len(contacts) > 1 else middle[0], *middle[1:]])
-    else:
-        point = pose.p + pose.R @ np.array(foot.point)
+    own = foot.point is not None
+    point = pose.p + pose.R @ np.array(foot.point) if own else contacts.mean(axis=0)
     body.add_site(name=names.point, pos=point, **_SITE)
 
 

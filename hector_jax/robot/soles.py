@@ -5,7 +5,8 @@ lie within 5 mm of the lowest one when all joints are zero. If the lowest box of
 this pose, its lower face is the sole; otherwise the sole is level. A sole wider than 2 cm at its
 front and at its back, under a leg of six joints or more, is flat with four corners. Any other sole
 longer than 2 cm is a line from heel to toe, and a shorter one a point. Both feet of a pair get the
-same lengths.
+same lengths. Wrenches act in the middle of the contacts: under an ankle with a short heel the plan
+would have no room behind the foot point.
 """
 
 from collections.abc import Mapping, Sequence
@@ -183,7 +184,6 @@ def _sole(
     """Return a sole by points in the frame of the body that the leg's last joint moves."""
     body = int(data.model.jnt_bodyid[joint])
     R, origin = data.xmat[body].reshape(3, 3), data.xpos[body] - data.xanchor[joint]
-    x, middle = contacts[:, 0], 0.5 * (contacts.min(axis=0) + contacts.max(axis=0))
     aligned = np.allclose(np.abs(axes.T @ R).max(axis=0), 1.0, rtol=0.0, atol=1e-9)
     aligned = aligned and np.abs(origin - np.round(origin, 4)).max() <= 1e-9
     digits = 4 if aligned or len(contacts) == 1 else 8  # rounding cannot tilt a single point
@@ -193,12 +193,7 @@ def _sole(
 
     section: dict[str, Any] = {"body": data.model.body(body).name}
     section["contacts"] = [*map(rounded, (contacts @ axes.T - origin) @ R)]
-    point = np.array([0.0, middle[1], middle[2]])
-    if not x.min() < -1e-3 < 1e-3 < x.max():  # the last joint is not above the sole
-        point = middle
-        if len(contacts) > 1:
-            section["point"] = rounded((axes @ point - origin) @ R)
-    return Sole(section, contacts, point, axes, guessed)
+    return Sole(section, contacts, contacts.mean(axis=0), axes, guessed)
 
 
 def _named_soles(survey: Survey, data: mujoco.MjData) -> tuple[Sole, ...] | None:

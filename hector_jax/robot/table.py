@@ -86,7 +86,8 @@ def remarks(robot: Robot) -> list[str]:
             f"joint {missing[0]!r} has no armature, without which backlash cannot be simulated: "
             "set joints.armature"
         )
-    if robot.heel > 1.2 * robot.toe:
+    ahead = (robot.sole[0].T @ robot.foot_point[0])[0]  # of the last joint
+    if robot.heel - ahead > 1.2 * (robot.toe + ahead):
         lines.append(
             "the heel is longer than the toe: if the robot looks along -x, turn the model so that "
             "x is ahead"
