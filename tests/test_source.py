@@ -308,7 +308,8 @@ def test_contacts_are_one_two_or_four_and_level(tmp_path):
     assert names == [f"{side}_contact_{i}" for side in ("left", "right") for i in range(4)]
     assert {model.geom(name).type[0] for name in names} == {int(mujoco.mjtGeom.mjGEOM_SPHERE)}
     tilted = ((0.07, 0.0, -0.04), (-0.05, 0.0, -0.03))
-    assert "soles are not level" in refused(small(tmp_path, contacts=tilted))
+    with pytest.raises(ValueError, match="soles are not level"):
+        robot_of(small(tmp_path, contacts=tilted))
     path = tmp_path / "robot.toml"
     three = "{ body = 'a', contacts = [[0, 0, 0], [1, 0, 0], [0, 1, 0]] }"
     path.write_text(f"model = 'small.xml'\n[feet]\nleft = {three}\nright = {three}\n")

@@ -45,7 +45,7 @@ LEG_JOINTS = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle")
 FEWEST_JOINTS, MOST_JOINTS = 3, 7  # of a leg
 CONTROL = ("gait", "mpc", "footstep", "legs")  # sections that the controller reads
 
-_MAX_BYTES = 100_000
+MAX_BYTES = 100_000
 
 Triple = tuple[float, float, float]
 
@@ -346,7 +346,7 @@ def read_description(path: Path) -> Description:
         InputError: one line naming the file, the key, the value received and the expected one.
     """
     path = Path(path)
-    return description_of(path, read_toml(path, "the robot description", _MAX_BYTES))
+    return description_of(path, read_toml(path, "the robot description", MAX_BYTES))
 
 
 def description_of(path: Path, table: dict[str, Any]) -> Description:
