@@ -51,6 +51,7 @@ from hector_jax.robot.survey import Survey, survey_file
 MASS, HEIGHT = 12.0, 0.423  # of HECTOR [kg], [m]
 _SWING_FREQUENCY = 30.0  # of the joint control of a swing leg [rad/s]
 _KP_PER_LIMIT = 2.0  # [1/rad]
+_NAMES = ("name", "model", "standing", "joints", "feet")  # what is found, not ruled
 _ARMATURE_PER_LIMIT = 2e-4  # [s^2]: HECTOR's has 2.4e-4, Unitree's robots 1e-4 to 4e-4
 
 
@@ -95,15 +96,13 @@ def propose(path: Path) -> Proposal:
     try:
         if not (named and "feet" in own and "standing" in own):
             found = _find(path.with_name(own["model"]), found, named, wrong)
-        description = description_of(path.with_suffix(".toml"), found.table)
+        names = {key: found.table[key] for key in _NAMES if key in found.table}
+        description = description_of(path.with_suffix(".toml"), names)
         robot = robot_of(description, checked=False)
         if armature := _armature(description, robot):
-            table = _merged({"joints": {"armature": armature}}, found.table)
-            found, description = (
-                found._replace(table=table),
-                description_of(description.path, table),
-            )
-        table = _merged(_settings(size_of(description, robot)), found.table)
+            names["joints"] = _merged({"armature": armature}, names["joints"])
+            description = description_of(description.path, names)
+        table = _merged(_settings(size_of(description, robot)), found.table | names)
         description = description_of(description.path, table)
         found = found._replace(table=table, robot=robot_of(description, checked=False))
         robot_of(description)

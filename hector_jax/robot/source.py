@@ -161,8 +161,9 @@ def _check_joints(file: _File) -> None:
     last = description.joints[description.leg_joints - 1 :: description.leg_joints]
     text = f"joints {listed(endless)} turn without end, as wheels do, expected feet: fix them"
     expect(path, not endless or not set(endless) <= set(last), text)
-    text = f"joint {_nor(endless)}, expected limits (in a URDF: revolute, lower and upper)"
-    expect(path, not endless, text.format("range"))
+    without = [name for name in endless if not model.jnt_limited[model.joint(name).id]]
+    text = f"joint {_nor(without)}, expected limits (in a URDF: revolute, lower and upper)"
+    expect(path, not without, text.format("range"))
     for j in file.joints:
         body, joint = int(model.jnt_bodyid[j]), f"joint {model.joint(j).name!r}"
         expect(path, model.jnt_type[j] == _JOINT.mjJNT_HINGE, f"{joint} is not a hinge")
