@@ -3,19 +3,26 @@
 import re
 import sys
 import tomllib
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 from published import JOINTS, MOTOR, small
 
+from hector_jax.cli.arguments import data_folder
 from hector_jax.cli.main import main
 from hector_jax.core.inputs import InputError
-from hector_jax.robot.model import load_robot
-from hector_jax.robot.propose import propose
-from hector_jax.robot.source import build_spec
-from hector_jax.robot.survey import survey_file
-from hector_jax.robot.table import remarks, table_of
+from hector_jax.core.settings import as_toml
+from hector_jax.core.tree_file import save_tree
+from hector_jax.robot.description import read_description
+from hector_jax.robot.importer.propose import propose
+from hector_jax.robot.importer.source import build_spec
+from hector_jax.robot.importer.survey import survey_file
+from hector_jax.robot.importer.table import remarks, table_of
+from hector_jax.robot.model import compile_model, load_robot
+
+HUMANOID = Path(__file__).parents[1] / "examples" / "humanoid" / "humanoid.xml"
 
 
 def edited(folder, *changes, **parts):
@@ -370,6 +377,51 @@ def test_legs_that_a_file_names_are_taken(tmp_path):
     proposal = propose(path)
     assert proposal.table["joints"]["left"] == joints["left"]
     assert "left_ankle" in proposal.table["joints"]["weld"]
+
+
+@pytest.mark.parametrize("kind", ["line", "point", "flat"])
+def test_the_standard_form_is_read_as_it_is_and_is_the_same_robot(monkeypatch, tmp_path, kind):
+    model, out = edited(tmp_path), tmp_path / "new.toml"
+    if kind == "point":
+        model = stilts(tmp_path, FOUR, BALL)
+    elif kind == "flat":
+        model = HUMANOID
+    assert command(monkeypatch, model, "--out", out) == 0
+    description = read_description(out)
+    assert build_spec(description).notes == ()
+    assert description.standing == description.standing_key
+    assert description.weld == description.armature == ()
+    own, robot = propose(model).robot, load_robot(out)
+    assert robot.structure == own.structure
+    assert robot.structure.contact == kind
+    for name in own._fields[:-2]:
+        np.testing.assert_allclose(getattr(robot, name), getattr(own, name), atol=2e-5, rtol=1e-4)
+    names = (
+        "geom_contype geom_conaffinity geom_type dof_armature dof_frictionloss exclude_signature"
+    )
+    for name in names.split():
+        arrays = (getattr(compile_model(x.description), name) for x in (robot, own))
+        np.testing.assert_allclose(*arrays, rtol=1e-5)
+
+
+def test_robots_whose_files_have_one_name_do_not_share_data(tmp_path):
+    data, paths = tmp_path / "data", [tmp_path / x / "robot.toml" for x in ("a", "b")]
+    robots = []
+    for path, mass in zip(paths, ("4", "5"), strict=True):
+        path.parent.mkdir()
+        model = edited(path.parent, ('mass="4" diag', f'mass="{mass}" diag'))
+        path.write_text(as_toml(propose(model).table, []))
+        robots.append(load_robot(path))
+    assert [robot.description.name for robot in robots] == ["robot", "robot"]
+    first, second = (data_folder(data, *pair) for pair in zip(paths, robots, strict=True))
+    assert first == second == data / "robot"
+    save_tree(first / "walks" / "0.npz", {"x": np.zeros(1)}, kind="walks", robot=robots[0])
+    first, second = (data_folder(data, *pair) for pair in zip(paths, robots, strict=True))
+    assert first == data / "robot"
+    assert re.fullmatch(r"robot-[0-9a-f]{6}", second.name)
+    (first / "walks" / "0.npz").write_bytes(b"damaged")
+    assert data_folder(data, paths[0], robots[0]) == first
+    assert data_folder(data, None, robots[0]) == data
 
 
 def test_a_file_for_another_robot_names_the_command(tmp_path):

@@ -23,11 +23,11 @@ from hector_jax.robot.description import (
     description_of,
     read_description,
 )
-from hector_jax.robot.model import compile_model, robot_of
-from hector_jax.robot.propose import HEIGHT, MASS, propose, size_of
-from hector_jax.robot.soles import find_soles
-from hector_jax.robot.survey import survey_file
-from hector_jax.robot.table import remarks
+from hector_jax.robot.importer.propose import HEIGHT, MASS, propose, size_of
+from hector_jax.robot.importer.soles import find_soles
+from hector_jax.robot.importer.survey import survey_file
+from hector_jax.robot.importer.table import remarks
+from hector_jax.robot.model import compile_model, load_robot, robot_of
 from hector_jax.tuning.loss import loss_of_robot
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -253,13 +253,17 @@ def test_a_proposal_is_written_once_and_beside_its_model(monkeypatch, capsys, tm
     model, out = small(tmp_path).model, tmp_path / "robot.toml"
     assert call(monkeypatch, model, "--out", out) == 0
     assert out.read_text().startswith("# Proposed by `hector robot ")
-    assert read_description(out).model == model
+    assert read_description(out).model == tmp_path / "robot-standard.xml"
     assert call(monkeypatch, out) == 0
+    other = tmp_path / "other" / "robot.toml"
+    assert call(monkeypatch, model, "--out", other) == 0
+    assert load_robot(other).mass == load_robot(out).mass
+    other.unlink()
     capsys.readouterr()
     for wrong, text in (
         (out, "must be a new file"),
         (tmp_path / "robot.txt", "must end in .toml"),
-        (tmp_path / "other" / "robot.toml", "must be beside the model"),
+        (other, "robot-standard.xml, which must be a new file"),
     ):
         assert call(monkeypatch, model, "--out", wrong) == 2
         assert text in capsys.readouterr().err
@@ -281,10 +285,11 @@ def test_a_disk_that_gets_full_leaves_no_part_of_a_proposal(monkeypatch, capsys,
     before = sorted(tmp_path.iterdir())
     with full_disk():
         assert call(monkeypatch, model, "--out", out) == 1
-    assert f"hector: cannot write {out}: File too large" in capsys.readouterr().err
+    standard = tmp_path / "robot-standard.xml"
+    assert f"hector: cannot write {standard}: File too large" in capsys.readouterr().err
     assert sorted(tmp_path.iterdir()) == before
     assert call(monkeypatch, model, "--out", out) == 0
-    assert read_description(out).model == model
+    assert read_description(out).model == standard
 
 
 def test_a_model_that_cannot_be_used_is_shown_as_far_as_it_goes(monkeypatch, capsys, tmp_path):

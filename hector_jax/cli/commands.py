@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial, singledispatch
+from pathlib import Path
 from typing import Any
 
 from hector_jax.cli import arguments, doctor, evaluate, flags, propose, tune, verdict, view
@@ -18,9 +19,10 @@ from hector_jax.core.runtime import workers
 from hector_jax.core.settings import as_toml
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.report.compare import compare_runs, print_comparison
+from hector_jax.robot.importer.propose import Proposal, standard_form
+from hector_jax.robot.importer.propose import propose as propose_robot
+from hector_jax.robot.importer.table import changes, remarks, table_of
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.robot.propose import propose as propose_robot
-from hector_jax.robot.table import changes, remarks, table_of
 from hector_jax.runs import export, nets, searches, tunings
 from hector_jax.runs.folder import RESULT, load_run, read_request
 from hector_jax.runs.setup import Setup
@@ -145,9 +147,6 @@ def examine_robot(args: flags.Robot) -> None:
             raise InputError(f"--out must end in .toml, got {str(out)!r}")
         if out.exists():
             raise InputError(f"--out must be a new file, and {out} exists")
-        folder = file.absolute().parent
-        if out.absolute().parent.resolve() != folder.resolve():
-            raise InputError(f"--out must be beside the model, in {folder}, got {str(out)!r}")
     proposal = propose_robot(file)
     error = proposal.error or _unfit(proposal.robot)
     lines, told, is_toml = [], [], file.suffix == ".toml"
@@ -159,15 +158,32 @@ def examine_robot(args: flags.Robot) -> None:
     print("\n".join([*lines, *_list("wrong", [*told, *proposal.wrong])]))
     head = f"Proposed by `hector robot {file.name}`; rules: docs/howto/robot.md."
     wrong = [*told, *proposal.wrong] if error else proposal.wrong
-    text = as_toml(proposal.table, [head, *(f"To be mended: {line}" for line in wrong)])
+    comments = [head, *(f"To be mended: {line}" for line in wrong)]
+    text = as_toml(proposal.table, comments)
     if out is not None:
-        write_file(out, text.encode())
+        _write_robot(out, proposal, comments, file)
         next_step = f"mend it, then: hector robot {out}" if error else "walk with it: hector walk"
         say(f"the proposal is in {out}; {next_step}{'' if error else f' --robot {out}'}")
     elif proposal.filled:
         print(f"\n{text}", end="")
     if error:
         raise InputError(error)
+
+
+def _write_robot(out: Path, proposal: Proposal, comments: Sequence[str], file: Path) -> None:
+    """Write a robot in the standard form, or a draft beside a copy of the model that it names."""
+    table, name = proposal.table, str(proposal.table["model"])
+    source, model = file.with_name(name), out.with_name(name)
+    if proposal.wrong:
+        text = source.read_text() if source.exists() and not model.exists() else None
+    else:
+        model = out.with_name(f"{out.stem}-standard.xml")
+        if model.exists():
+            raise InputError(f"--out writes {model}, which must be a new file, and it exists")
+        table, text = standard_form(proposal, model.name)
+    if text is not None:
+        write_file(model, text.encode())
+    write_file(out, as_toml(table, comments).encode())
 
 
 def _unfit(robot: Robot | None) -> str | None:

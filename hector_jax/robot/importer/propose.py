@@ -42,11 +42,11 @@ from hector_jax.core.settings import read_toml
 from hector_jax.core.trajectory import FEET
 from hector_jax.robot.checks import standing_data
 from hector_jax.robot.description import MAX_BYTES, Description, description_of
+from hector_jax.robot.importer.soles import Sole, find_soles
+from hector_jax.robot.importer.stand import standing_pose
+from hector_jax.robot.importer.survey import Survey, survey_file
 from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.model import Robot, build_model, quiet_mujoco, robot_of
-from hector_jax.robot.soles import Sole, find_soles
-from hector_jax.robot.stand import standing_pose
-from hector_jax.robot.survey import Survey, survey_file
 
 MASS, HEIGHT = 12.0, 0.423  # of HECTOR [kg], [m]
 _SWING_FREQUENCY = 30.0  # of the joint control of a swing leg [rad/s]
@@ -111,6 +111,24 @@ def propose(path: Path) -> Proposal:
         wrong.append(error)
     filled = tuple(_left_out(found.table, own))
     return found._replace(wrong=tuple(wrong), filled=filled, error=error)
+
+
+def standard_form(proposal: Proposal, model: str) -> tuple[dict[str, Any], str]:
+    """Return TOML table and MJCF of a proposed robot in the standard form, which has all names.
+
+    Args:
+        proposal: of a robot that can be used.
+        model: name of the file of the MJCF.
+    """
+    assert proposal.robot is not None
+    description, table = proposal.robot.description, proposal.table
+    joints = {key: x for key, x in table["joints"].items() if key not in ("weld", "armature")}
+    feet = {
+        leg: {"point": foot.point, "contacts": list(foot.contacts)}
+        for leg, foot in zip(description.legs, description.named_feet, strict=True)
+    }
+    named = {"standing": description.standing_key, "joints": joints, "feet": feet}
+    return table | {"model": model} | named, build_model(description)[0].to_xml()
 
 
 def _find(

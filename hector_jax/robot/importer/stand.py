@@ -17,9 +17,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from hector_jax.core.headless import mujoco
+from hector_jax.robot.importer.soles import Sole
+from hector_jax.robot.importer.survey import Survey
 from hector_jax.robot.links import data_at
-from hector_jax.robot.soles import Sole
-from hector_jax.robot.survey import Survey
 
 KNEE = 1.0  # [rad] of the first trial
 _NEARLY_STRAIGHT = 0.1  # [rad] of a knee at zero: offsets of a design, which are no bend

@@ -8,11 +8,11 @@ from jaxtyping import Bool, Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.robot.checks import standing_data, trunk_body
+from hector_jax.robot.importer.source import build_spec
+from hector_jax.robot.importer.survey import axis_words
 from hector_jax.robot.kinematics import knee_joints
 from hector_jax.robot.links import data_at
 from hector_jax.robot.model import Robot, build_model
-from hector_jax.robot.source import build_spec
-from hector_jax.robot.survey import axis_words
 
 _HEADER = ("joint", "axis", "range [rad]", "motor [N m]", "link [kg]", "standing [rad]")
 _HEAVY_LEGS = 0.35  # share of the robot's mass
