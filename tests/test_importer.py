@@ -17,9 +17,10 @@ from hector_jax.core.settings import as_toml
 from hector_jax.core.tree_file import save_tree
 from hector_jax.robot.description import read_description
 from hector_jax.robot.importer.propose import propose
+from hector_jax.robot.importer.remarks import remarks
 from hector_jax.robot.importer.source import build_spec
 from hector_jax.robot.importer.survey import survey_file
-from hector_jax.robot.importer.table import remarks, table_of
+from hector_jax.robot.importer.table import table_of
 from hector_jax.robot.model import compile_model, load_robot
 
 HUMANOID = Path(__file__).parents[1] / "examples" / "humanoid" / "humanoid.xml"
@@ -91,6 +92,21 @@ def test_shapes_that_overlap_and_do_not_in_the_file_are_named(tmp_path):
     assert line.startswith("bodies left_thigh and right_thigh overlap when standing, and not in")
     both = ('type="cylinder" size="0.03 0.08"', 'type="capsule" size="0.11 0.02"')
     assert not [x for x in told(edited(tmp_path, both)) if "overlap" in x]
+
+
+def test_what_pushes_bodies_is_refused_and_named(tmp_path):
+    lifted = ('<body name="torso"', '<body name="torso" gravcomp="1"')
+    with pytest.raises(InputError, match=r"'torso' push bodies \(gravcomp"):
+        survey_file(edited(tmp_path, lifted))
+    jet = "<general name='jet' body='torso'/>"
+    with pytest.raises(InputError, match=r"'jet' push bodies .*expected motors of joints alone"):
+        survey_file(edited(tmp_path, motors=jet))
+
+
+def test_a_slide_in_a_leg_is_named(tmp_path):
+    slide = (r'name="(\w+)_knee" axis="0 1 0"', r'name="\1_knee" type="slide" axis="0 0 1"')
+    with pytest.raises(InputError, match="no hinges: left_knee, right_knee"):
+        survey_file(edited(tmp_path, slide))
 
 
 @pytest.mark.parametrize("mass", [1e-7, 0.3])
@@ -337,6 +353,10 @@ def test_a_draft_has_what_was_found_and_what_is_to_be_mended(monkeypatch, capsys
     assert draft["joints"]["left"] == JOINTS[:4]
     assert draft["feet"]["left"]["body"] == "left_foot"
     assert "has no range" in capsys.readouterr().err
+    unlike = ('(?s)(right_foot.*?)size="0.06 0.03 0.01"', r'\1size="0.09 0.03 0.01"')
+    proposal = propose(edited(tmp_path, unlike))
+    assert "expected the same" in proposal.wrong[0]
+    assert proposal.table["joints"]["left"] == JOINTS[:4]
     (tmp_path / "none.xml").write_text("<mujoco><worldbody/></mujoco>")
     assert command(monkeypatch, tmp_path / "none.xml") == 2
     assert "# To be mended: " in (printed := capsys.readouterr().out)

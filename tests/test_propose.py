@@ -24,9 +24,9 @@ from hector_jax.robot.description import (
     read_description,
 )
 from hector_jax.robot.importer.propose import HEIGHT, MASS, propose, size_of
+from hector_jax.robot.importer.remarks import remarks
 from hector_jax.robot.importer.soles import find_soles
 from hector_jax.robot.importer.survey import survey_file
-from hector_jax.robot.importer.table import remarks
 from hector_jax.robot.model import compile_model, load_robot, robot_of
 from hector_jax.tuning.loss import loss_of_robot
 

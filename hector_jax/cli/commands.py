@@ -21,7 +21,8 @@ from hector_jax.grfm.training import TrainConfig
 from hector_jax.report.compare import compare_runs, print_comparison
 from hector_jax.robot.importer.propose import Proposal, standard_form
 from hector_jax.robot.importer.propose import propose as propose_robot
-from hector_jax.robot.importer.table import changes, remarks, table_of
+from hector_jax.robot.importer.remarks import remarks
+from hector_jax.robot.importer.table import changes, table_of
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import export, nets, searches, tunings
 from hector_jax.runs.folder import RESULT, load_run, read_request

@@ -57,8 +57,17 @@ def spec_of(
             if any(len(part) for part in parts):
                 notes.append(f"<{tag}> is not used")
             _remove(root, parts)
-        for section in root.findall("actuator"):  # not those of tendons, sites, bodies
-            _remove(section, [m for m in section if not {"joint", "jointinparent"} & set(m.attrib)])
+        held = [x for x in root.iter("body") if x.get("gravcomp", "0") != "0"]
+        held += [x for x in root.findall("actuator/*") if {"site", "body"} & {*x.attrib}]
+        text = (
+            f"{', '.join(repr(x.get('name', '')) for x in held)} push bodies (gravcomp, actuators "
+        )
+        text += "of sites and bodies), expected motors of joints alone: remove that"
+        expect(path, not held, text)
+        for section in root.findall("actuator"):
+            tendons = [m for m in section if not {"joint", "jointinparent"} & set(m.attrib)]
+            notes += ["actuators of tendons are not used"] * bool(tendons)
+            _remove(section, tendons)
         for section in root.findall("keyframe"):
             _remove(section, [key for key in section if key.get("name") != keyframe])
             for key in section:

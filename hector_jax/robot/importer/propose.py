@@ -28,7 +28,6 @@ of mass m and height h:
 """
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -92,10 +91,12 @@ def propose(path: Path) -> Proposal:
     joints, wrong, error = own.get("joints"), [], None
     joints = joints if isinstance(joints, dict) else {}
     named = [list(map(str, joints[leg])) for leg in sum(FEET.values(), ()) if leg in joints]
-    found = Proposal({"name": _name(path), **own}, (), ())
+    stem = "".join(x if x.isalnum() or x in "-_" else "-" for x in path.stem)
+    found = Proposal({"name": stem, **own}, (), ())
     try:
         if not (named and "feet" in own and "standing" in own):
-            found = _find(path.with_name(own["model"]), found, named, wrong)
+            found = _with_legs(survey_file(path.with_name(own["model"]), named), found)
+            found = _with_feet(found, wrong)
         names = {key: found.table[key] for key in _NAMES if key in found.table}
         description = description_of(path.with_suffix(".toml"), names)
         robot = robot_of(description, checked=False)
@@ -131,18 +132,19 @@ def standard_form(proposal: Proposal, model: str) -> tuple[dict[str, Any], str]:
     return table | {"model": model} | named, build_model(description)[0].to_xml()
 
 
-def _find(
-    path: Path, found: Proposal, named: Sequence[Sequence[str]], wrong: list[str]
-) -> Proposal:
-    """Return a proposal with legs, feet and standing angles, and what is in its table already."""
-    survey = survey_file(path, named)
-    joints = {
-        leg: [survey.model.joint(j).name for j in ids]
-        for leg, ids in zip(FEET[len(survey.legs)], survey.legs, strict=True)
-    }
+def _with_legs(survey: Survey, found: Proposal) -> Proposal:
+    """Return a proposal with the legs of a survey; what its table has stays."""
+    legs = zip(FEET[len(survey.legs)], survey.legs, strict=True)
+    joints: dict[str, Any] = {x: [survey.model.joint(j).name for j in leg] for x, leg in legs}
     if survey.weld:
         joints["weld"] = list(survey.weld)
-    found = found._replace(survey=survey, table=_merged({"joints": joints}, found.table))
+    return found._replace(survey=survey, table=_merged({"joints": joints}, found.table))
+
+
+def _with_feet(found: Proposal, wrong: list[str]) -> Proposal:
+    """Return a proposal with feet and standing angles; what its table has stays."""
+    survey = found.survey
+    assert survey is not None
     soles = find_soles(survey)
     angles, balanced = standing_pose(survey, soles)
     if len(soles[0].contacts) == 1:  # a round foot, whose contact moves when the leg bends
@@ -163,10 +165,6 @@ def _find(
     table = {"standing": angles, "joints": {}, "feet": feet} | found.table
     order = dict.fromkeys(("name", "model", "standing"))
     return found._replace(soles=soles, table=order | table)
-
-
-def _name(path: Path) -> str:
-    return "".join(x if x.isalnum() or x in "-_" else "-" for x in path.stem)
 
 
 def _merged(rules: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ reported in a note.
 """
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,18 +38,6 @@ class Source(NamedTuple):
     notes: tuple[str, ...]  # one line per change to the file
     file: mujoco.MjData  # the file's own bodies in the standing pose
     links: list[Link]
-
-    def overlaps(self) -> list[str]:
-        """Return one line for each two links that touch, standing, and do not in the file."""
-        data = mujoco.MjData(self.spec.compile())
-        mujoco.mj_resetDataKeyframe(data.model, data, 0)
-        now = _touching(data, {data.model.body(link.name).id: link.name for link in self.links})
-        then = _touching(self.file, {b: link.name for link in self.links for b in link.bodies})
-        return [
-            f"bodies {' and '.join(pair)} overlap when standing, and not in the file: exclude them "
-            "under <contact>, or make a shape smaller"
-            for pair in sorted(now - then)
-        ]
 
 
 class _File(NamedTuple):
@@ -89,15 +77,6 @@ def build_spec(description: Description) -> Source:
     leg_angles = [angles[joint] for joint in file.joints]
     spec = rebuild(description, Pieces(file.model, links, limits, leg_angles, trunk_quat))
     return Source(spec, (*notes, *changes), standing, links)
-
-
-def _touching(data: mujoco.MjData, links: Mapping[int, str]) -> set[tuple[str, ...]]:
-    """Return the names of each two links that overlap."""
-    mujoco.mj_kinematics(data.model, data)
-    mujoco.mj_collision(data.model, data)
-    bodies = [data.model.geom_bodyid[x.geom] for x in data.contact if x.dist < 0.0]
-    pairs = [{links.get(int(b), "") for b in pair} for pair in bodies]
-    return {tuple(sorted(pair)) for pair in pairs if len(pair) == 2 and "" not in pair}
 
 
 def compile_bare(path: Path, root: ElementTree.Element, spec: mujoco.MjSpec) -> mujoco.MjModel:

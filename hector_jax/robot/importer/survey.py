@@ -139,6 +139,8 @@ def _legs(path: Path, data: mujoco.MjData, free: Sequence[int]) -> tuple[tuple[i
     ends = ", ".join(f"{model.joint(chain[-1]).name} ({len(chain)})" for chain in chains)
     text = f"no two legs found, expected two chains of {FEWEST_JOINTS} to {MOST_JOINTS} hinges "
     text += f"that mirror each other; chains by their last joint: {ends or 'none'}"
+    odd = np.flatnonzero((model.jnt_type != _HINGE) & (model.jnt_type != _FREE))
+    text += f"; no hinges: {', '.join(model.joint(j).name for j in odd)}" * bool(len(odd))
     if apart:
         not_turned, offset, one, other = min(apart, key=lambda pair: pair[:2])
         text += (
