@@ -382,7 +382,7 @@ def test_what_a_hand_written_file_leaves_out_is_filled_in_by_the_rules(
     assert "left out " in capsys.readouterr().out
     assert command(monkeypatch, path, "--out", out) == 0
     assert load_robot(out).mass == pytest.approx(float(proposal.robot.mass), rel=1e-6)
-    assert propose(out).filled == ()
+    assert not propose(out).filled
 
 
 def test_legs_that_a_file_names_are_taken(tmp_path):

@@ -66,8 +66,6 @@ def read_mjcf(path: Path) -> ElementTree.Element:
         raise InputError(f"{path}: root element is <{root.tag[:40]}>, expected <mujoco> or <robot>")
     if root.tag == "robot":
         root[:] = [part for part in root if part.tag in _URDF_PARTS]
-        for part in root.findall("mujoco"):
-            part[:] = part.findall("compiler")
     bodies = joints = 0
     for element, label in _labelled(path, root):
         file = f" of {short_repr(element.get('file'))}" if "file" in element.attrib else ""

@@ -48,10 +48,6 @@ def spec_of(
         removed = _clean_urdf(path, root, joints)
     else:
         _check_couplings(path, root, joints)
-        for section in root.findall("contact"):
-            pairs = section.findall("pair")
-            notes += ["contact pairs are not used"] * bool(pairs)
-            _remove(section, pairs)
         for tag in _UNUSED:
             parts = root.findall(tag)
             if any(len(part) for part in parts):
@@ -59,15 +55,15 @@ def spec_of(
             _remove(root, parts)
         held = [x for x in root.iter("body") if x.get("gravcomp", "0") != "0"]
         held += [x for x in root.findall("actuator/*") if {"site", "body"} & {*x.attrib}]
-        text = (
-            f"{', '.join(repr(x.get('name', '')) for x in held)} push bodies (gravcomp, actuators "
-        )
-        text += "of sites and bodies), expected motors of joints alone: remove that"
-        expect(path, not held, text)
-        for section in root.findall("actuator"):
-            tendons = [m for m in section if not {"joint", "jointinparent"} & set(m.attrib)]
-            notes += ["actuators of tendons are not used"] * bool(tendons)
-            _remove(section, tendons)
+        names = ", ".join(repr(x.get("name", "")) for x in held)
+        text = f"{names} push bodies (gravcomp, actuators of sites and bodies), expected motors of "
+        expect(path, not held, f"{text}joints alone: remove that")
+        of_joints = {"joint", "jointinparent"}
+        tendons = [x for x in root.findall("actuator/*") if not of_joints & {*x.attrib}]
+        for tag, unused in (("contact", root.findall("contact/pair")), ("actuator", tendons)):
+            notes += [f"<{part.tag}> of <{tag}> is not used" for part in unused[:1]]
+            for section in root.findall(tag):
+                _remove(section, [part for part in section if part in unused])
         for section in root.findall("keyframe"):
             _remove(section, [key for key in section if key.get("name") != keyframe])
             for key in section:

@@ -59,7 +59,7 @@ class Proposal(NamedTuple):
 
     table: dict[str, Any]
     wrong: tuple[str, ...]  # one line per problem to correct by hand
-    filled: tuple[str, ...]  # keys that the file does not have, which are proposed
+    filled: Sequence[str]  # keys that the file does not have, which are proposed
     survey: Survey | None = None  # None: the file names all, or it has no legs
     soles: tuple[Sole, ...] = ()
     robot: Robot | None = None  # None: it cannot be built
@@ -110,8 +110,7 @@ def propose(path: Path) -> Proposal:
     except InputError as raised:
         error = str(raised)
         wrong.append(error)
-    filled = tuple(_left_out(found.table, own))
-    return found._replace(wrong=tuple(wrong), filled=filled, error=error)
+    return found._replace(wrong=tuple(wrong), filled=_left_out(found.table, own), error=error)
 
 
 def standard_form(proposal: Proposal, model: str) -> tuple[dict[str, Any], str]:
@@ -136,8 +135,7 @@ def _with_legs(survey: Survey, found: Proposal) -> Proposal:
     """Return a proposal with the legs of a survey; what its table has stays."""
     legs = zip(FEET[len(survey.legs)], survey.legs, strict=True)
     joints: dict[str, Any] = {x: [survey.model.joint(j).name for j in leg] for x, leg in legs}
-    if survey.weld:
-        joints["weld"] = list(survey.weld)
+    joints |= {"weld": list(survey.weld)} if survey.weld else {}
     return found._replace(survey=survey, table=_merged({"joints": joints}, found.table))
 
 
@@ -163,8 +161,7 @@ def _with_feet(found: Proposal, wrong: list[str]) -> Proposal:
         )
     feet = dict(zip(FEET[len(soles)], (sole.section for sole in soles), strict=True))
     table = {"standing": angles, "joints": {}, "feet": feet} | found.table
-    order = dict.fromkeys(("name", "model", "standing"))
-    return found._replace(soles=soles, table=order | table)
+    return found._replace(soles=soles, table=table)
 
 
 def _merged(rules: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:

@@ -109,6 +109,6 @@ def _ranges(model: mujoco.MjModel, joints: Sequence[int]) -> tuple[np.ndarray, n
     limited = model.jnt_limited[joints].astype(bool)
     low, high = model.jnt_range[joints].T
     margin = np.minimum(_MARGIN, 0.1 * (high - low))
-    turn = 2.0 * np.pi  # a wheel's range has no end
-    low, high = np.clip([low + margin, high - margin], -turn, turn)
+    # ranges of wheels, and those in degrees, go beyond a turn
+    low, high = np.clip([low + margin, high - margin], -2.0 * np.pi, 2.0 * np.pi)
     return np.where(limited, low, -np.pi), np.where(limited, high, np.pi)

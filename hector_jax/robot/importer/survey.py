@@ -74,7 +74,7 @@ def survey_file(path: Path, named: Sequence[Sequence[str]] = ()) -> Survey:
         text = f"a joint of body {model.body(_body(model, j)).name!r} has no name, expected one: "
         expect(path, model.joint(j).name, f"{text}it is to be welded")
     knee = _knee(path, data, legs[0])
-    straight = tuple(_straight(data, leg, knee) for leg in legs)
+    knees = [_knee_bend(data, leg, knee) for leg in legs]
     return Survey(
         path=path,
         model=model,
@@ -82,11 +82,8 @@ def survey_file(path: Path, named: Sequence[Sequence[str]] = ()) -> Survey:
         legs=legs,
         weld=tuple(model.joint(j).name for j in others),
         knee=knee,
-        straight=straight,
-        forwards=tuple(
-            _bends_forwards(data, leg[knee], angle)
-            for leg, angle in zip(legs[::2], straight[::2], strict=True)
-        ),
+        straight=tuple(straight for straight, _ in knees),
+        forwards=tuple(ahead for _, ahead in knees[::2]),
     )
 
 
@@ -205,18 +202,17 @@ def _knee(path: Path, data: mujoco.MjData, leg: Sequence[int]) -> int:
     return max(pitch[1:], key=distance)
 
 
-def _straight(data: mujoco.MjData, leg: Sequence[int], knee: int) -> float:
-    """Return the knee's angle [rad] at which hip, knee and ankle, or the leg's end, are in line."""
+def _knee_bend(data: mujoco.MjData, leg: Sequence[int], knee: int) -> tuple[float, bool]:
+    """Return the straight knee's angle [rad] and whether a bent one points ahead.
+
+    Hip, knee and ankle, or the end of a leg without one, are in line when the leg is straight.
+    """
     joint = leg[knee]
     hip = next(j for j in leg if abs(data.xaxis[j][1]) >= MIN_Y)
     ankle = [j for j in leg[knee + 1 :] if abs(data.xaxis[j][1]) >= MIN_Y]
     lowest = min(data.xipos[subtree(data.model, _body(data.model, leg[-1]))], key=lambda p: p[2])
     anchor, end = data.xanchor[joint], data.xanchor[ankle[0]] if ankle else lowest
     (x, z), (u, w) = (anchor - data.xanchor[hip])[::2], (end - anchor)[::2]
-    return float(np.arctan2(x * w - z * u, x * u + z * w) * np.sign(data.xaxis[joint][1]))
-
-
-def _bends_forwards(data: mujoco.MjData, joint: int, straight: float) -> bool:
-    """Return whether a knee points ahead when it is bent."""
-    side = data.model.jnt_range[joint].sum() - 2.0 * straight
-    return bool(side * np.sign(data.xaxis[joint][1]) > 1e-6)
+    sign = float(np.sign(data.xaxis[joint][1]))
+    straight = sign * float(np.arctan2(x * w - z * u, x * u + z * w))
+    return straight, bool(sign * (data.model.jnt_range[joint].sum() - 2.0 * straight) > 1e-6)
