@@ -26,7 +26,7 @@ class Source(Enum):
     WEIGHTS = "nominal, expert, best or a weights file"
     SETS = "nominal, expert, best, a weights file, or a folder of one for each trajectory"
     TRAJECTORY = "a name or a TOML file"
-    ROBOT = "a TOML file that names an MJCF (docs/howto/robot.md)"
+    ROBOT = "a TOML file that names an MJCF: hector robot MODEL --out NAME.toml makes one"
 
 
 def named_file(text: str) -> tuple[str, str]:

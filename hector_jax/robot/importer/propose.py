@@ -59,7 +59,7 @@ class Proposal(NamedTuple):
 
     table: dict[str, Any]
     wrong: tuple[str, ...]  # one line per problem to correct by hand
-    filled: Sequence[str]  # keys that the file does not have, which are proposed
+    filled: list[str]  # keys that the file does not have, which are proposed
     survey: Survey | None = None  # None: the file names all, or it has no legs
     soles: tuple[Sole, ...] = ()
     robot: Robot | None = None  # None: it cannot be built
@@ -92,7 +92,7 @@ def propose(path: Path) -> Proposal:
     joints = joints if isinstance(joints, dict) else {}
     named = [list(map(str, joints[leg])) for leg in sum(FEET.values(), ()) if leg in joints]
     stem = "".join(x if x.isalnum() or x in "-_" else "-" for x in path.stem)
-    found = Proposal({"name": stem, **own}, (), ())
+    found = Proposal({"name": stem, **own}, (), [])
     try:
         if not (named and "feet" in own and "standing" in own):
             found = _with_legs(survey_file(path.with_name(own["model"]), named), found)
