@@ -28,8 +28,8 @@ from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, Range, check
 from hector_jax.report.report import markdown_table
+from hector_jax.robot.importer.propose import size_of
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.robot.propose import size_of
 from hector_jax.runs import metrics
 from hector_jax.sim.loop import Job
 from hector_jax.sim.margin import loops, modes

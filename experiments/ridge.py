@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 from lib import write_report
 
-from hector_jax.cli.arguments import robot_folder
+from hector_jax.cli.arguments import data_folder
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import nominal
 from hector_jax.core.console import exit_code
@@ -56,7 +56,7 @@ class Flags:
 def walk_robot(flags: Flags, pool: Executor, name: str, file: Path | None) -> Losses:
     """Tune and walk the sets of one robot."""
     robot = load_robot(file)
-    net = nets.load_or_train(pool, robot, robot_folder(flags.data, file, robot))
+    net = nets.load_or_train(pool, robot, data_folder(flags.data, file, robot))
     problems = {
         key: tunings.Problem(tuple(map(named_command, names)), net.params)
         for key, names in PROBLEMS.items()

@@ -96,6 +96,13 @@ def test_each_outside_package_has_its_door(package):
     assert {name for name in inside if not name.startswith(DOORS[package])} == set()
 
 
+def test_robots_of_others_come_in_by_one_door():
+    importer = "hector_jax.robot.importer"
+    inside = {name for name, target in IMPORTS if target.startswith(importer)}
+    outside = {name for name in inside if not name.startswith("robot.importer")}
+    assert outside == {"robot.model", "cli.commands"}
+
+
 def test_nothing_that_learns_or_searches_can_reach_the_stand_in():
     inside = {name for name, target in IMPORTS if target.startswith("hector_jax.sim.standin")}
     assert inside == {"cli.arguments"}

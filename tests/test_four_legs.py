@@ -20,11 +20,11 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import FEET, State, Wrench, pack_wrench
 from hector_jax.robot import srbm
 from hector_jax.robot.description import description_of
+from hector_jax.robot.importer.propose import propose
+from hector_jax.robot.importer.remarks import remarks
+from hector_jax.robot.importer.survey import survey_file
 from hector_jax.robot.kinematics import foot_poses, leg_gravity
 from hector_jax.robot.model import compile_model, load_robot, robot_of
-from hector_jax.robot.propose import propose
-from hector_jax.robot.survey import survey_file
-from hector_jax.robot.table import remarks
 
 FILE = Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml"
 MODEL = FILE.with_name("quadruped.xml")

@@ -16,18 +16,19 @@ from published import small, urdf_of
 from hector_jax.cli.main import main
 from hector_jax.control.controller import walk_config
 from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import as_toml
 from hector_jax.robot.description import (
     DESCRIPTION_PATH,
     MODEL_PATH,
     description_of,
     read_description,
 )
-from hector_jax.robot.model import compile_model, robot_of
-from hector_jax.robot.propose import HEIGHT, MASS, as_toml, propose, size_of
+from hector_jax.robot.importer.propose import HEIGHT, MASS, propose, size_of
+from hector_jax.robot.importer.remarks import remarks
+from hector_jax.robot.importer.soles import find_soles
+from hector_jax.robot.importer.survey import survey_file
+from hector_jax.robot.model import compile_model, load_robot, robot_of
 from hector_jax.robot.response import response, swing_frequency
-from hector_jax.robot.soles import find_soles
-from hector_jax.robot.survey import survey_file
-from hector_jax.robot.table import remarks
 from hector_jax.tuning.loss import loss_of_robot
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -137,6 +138,29 @@ def test_soles_of_meshes_are_asked_for(tmp_path):
     assert line.endswith("measure the sole and correct feet.left and feet.right")
 
 
+def test_wrenches_act_in_the_middle_of_a_sole_with_a_short_heel(tmp_path):
+    path = small(tmp_path).model
+    path.write_text(path.read_text().replace('pos="0.01 0 -0.03"', 'pos="0.05 0 -0.03"'))
+    proposal = propose(path)
+    assert proposal.wrong == ()
+    assert "point" not in proposal.table["feet"]["left"]
+    _, robot, _ = loaded(proposal)
+    np.testing.assert_allclose(robot.foot_point[:, 0], 0.05, atol=1e-4)
+    np.testing.assert_allclose([robot.toe, robot.heel], 0.06, atol=1e-4)
+    _, data = standing(robot)
+    ankles = [data.joint(f"{side}_ankle").xanchor[0] for side in ("left", "right")]
+    assert abs(data.subtree_com[1][0] - np.mean(ankles)) < 1e-3
+    assert not any("along -x" in line for line in remarks(robot))
+
+
+def test_a_sole_behind_the_ankle_is_told(tmp_path):
+    path = small(tmp_path).model
+    text = path.read_text().replace('pos="0.05 0 -0.03"', 'pos="-0.05 0 -0.03"')
+    path.write_text(text.replace('pos="0.01 0 -0.03"', 'pos="-0.01 0 -0.03"'))
+    _, robot, _ = loaded(propose(path))
+    assert any("along -x" in line for line in remarks(robot))
+
+
 def test_a_tilted_box_is_the_sole_and_is_level_standing(tmp_path):
     path = small(tmp_path).model
     text, box = path.read_text(), '<geom type="box" size="0.06 0.03 0.01" pos="0.01 0 -0.03"'
@@ -165,8 +189,8 @@ def test_the_standing_pose_bends_the_knees_and_balances_on_level_soles(humanoid)
     proposal, description, robot, _ = humanoid
     assert dict(description.standing)["left_knee"] == 1.0
     model, data = standing(robot)
-    points = [data.site(foot.point).xpos for foot in description.named_feet]
-    assert abs(data.subtree_com[1][0] - np.mean(points, axis=0)[0]) < 1e-3
+    ankles = [data.joint(f"{side}_ankle_pitch").xanchor[0] for side in ("left", "right")]
+    assert abs(data.subtree_com[1][0] - np.mean(ankles)) < 1e-3
     heights = [
         data.geom(name).xpos[2] - model.geom(name).size[0]
         for foot in description.named_feet
@@ -226,21 +250,23 @@ def test_a_toml_is_checked(monkeypatch, capsys, tmp_path):
     (tmp_path / "strider.xml").write_text(STRIDER.with_name("strider.xml").read_text())
     assert call(monkeypatch, path) == 2
     assert "legs.kp must be a gain for each of the 5 joints" in capsys.readouterr().err
-    assert call(monkeypatch, STRIDER, "--out", tmp_path / "new.toml") == 2
-    assert "--out is for a proposal" in capsys.readouterr().err
 
 
 def test_a_proposal_is_written_once_and_beside_its_model(monkeypatch, capsys, tmp_path):
     model, out = small(tmp_path).model, tmp_path / "robot.toml"
     assert call(monkeypatch, model, "--out", out) == 0
     assert out.read_text().startswith("# Proposed by `hector robot ")
-    assert read_description(out).model == model
+    assert read_description(out).model == tmp_path / "robot-standard.xml"
     assert call(monkeypatch, out) == 0
+    other = tmp_path / "other" / "robot.toml"
+    assert call(monkeypatch, model, "--out", other) == 0
+    assert load_robot(other).mass == load_robot(out).mass
+    other.unlink()
     capsys.readouterr()
     for wrong, text in (
         (out, "must be a new file"),
         (tmp_path / "robot.txt", "must end in .toml"),
-        (tmp_path / "other" / "robot.toml", "must be beside the model"),
+        (other, "robot-standard.xml, which must be a new file"),
     ):
         assert call(monkeypatch, model, "--out", wrong) == 2
         assert text in capsys.readouterr().err
@@ -262,10 +288,11 @@ def test_a_disk_that_gets_full_leaves_no_part_of_a_proposal(monkeypatch, capsys,
     before = sorted(tmp_path.iterdir())
     with full_disk():
         assert call(monkeypatch, model, "--out", out) == 1
-    assert f"hector: cannot write {out}: File too large" in capsys.readouterr().err
+    standard = tmp_path / "robot-standard.xml"
+    assert f"hector: cannot write {standard}: File too large" in capsys.readouterr().err
     assert sorted(tmp_path.iterdir()) == before
     assert call(monkeypatch, model, "--out", out) == 0
-    assert read_description(out).model == model
+    assert read_description(out).model == standard
 
 
 def test_a_model_that_cannot_be_used_is_shown_as_far_as_it_goes(monkeypatch, capsys, tmp_path):
@@ -274,8 +301,11 @@ def test_a_model_that_cannot_be_used_is_shown_as_far_as_it_goes(monkeypatch, cap
     path.write_text(re.sub(r"<motor\b[^>]*/>", "", text))
     assert call(monkeypatch, path) == 2
     out, err = capsys.readouterr()
-    assert "left_knee, right_knee" in out
-    assert "has no torque limit, expected forcerange or ctrlrange" in err
+    draft = tomllib.loads(out[out.index("# Proposed") :])
+    assert draft["joints"]["left"][3] == "left_knee"
+    assert draft["feet"]["left"]["body"] == "left_foot"
+    assert "'left_hip_pitch' has no torque limit, nor have left_hip_roll, " in err
+    assert "To be mended: " in out
 
 
 def test_what_is_likely_trouble_is_told():

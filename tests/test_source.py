@@ -11,8 +11,8 @@ from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert
 from hector_jax.robot.description import MODEL_PATH, Description, Foot, read_description
+from hector_jax.robot.importer.source import build_spec
 from hector_jax.robot.model import load_robot, robot_of
-from hector_jax.robot.source import build_spec
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import ideal
@@ -109,7 +109,7 @@ def by_numbers(folder, text, **changes):
     path.write_text(text)
     angles = {f"{s}_{j}": a for s in ("left", "right") for j, a in BEND.items()}
     feet = tuple(
-        Foot(None, ((0.09, 0.0, -0.04), (-0.06, 0.0, -0.04)), f"{side}_foot")
+        Foot((0.0, 0.0, -0.04), ((0.09, 0.0, -0.04), (-0.06, 0.0, -0.04)), f"{side}_foot")
         for side in ("left", "right")
     )
     return Description(
@@ -308,7 +308,8 @@ def test_contacts_are_one_two_or_four_and_level(tmp_path):
     assert names == [f"{side}_contact_{i}" for side in ("left", "right") for i in range(4)]
     assert {model.geom(name).type[0] for name in names} == {int(mujoco.mjtGeom.mjGEOM_SPHERE)}
     tilted = ((0.07, 0.0, -0.04), (-0.05, 0.0, -0.03))
-    assert "soles are not level" in refused(small(tmp_path, contacts=tilted))
+    with pytest.raises(ValueError, match="soles are not level"):
+        robot_of(small(tmp_path, contacts=tilted))
     path = tmp_path / "robot.toml"
     three = "{ body = 'a', contacts = [[0, 0, 0], [1, 0, 0], [0, 1, 0]] }"
     path.write_text(f"model = 'small.xml'\n[feet]\nleft = {three}\nright = {three}\n")

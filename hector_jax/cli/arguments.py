@@ -1,6 +1,7 @@
 """Shared parts of the commands: weights, robots, plants and trajectories of flags, and printing."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,6 +22,7 @@ from hector_jax.core.files import as_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import to_table
 from hector_jax.core.trajectory import Trajectory
+from hector_jax.core.tree_file import ROBOT_DIGITS, read_card, tree_hash
 from hector_jax.robot.description import Description
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import verdicts
@@ -80,6 +82,18 @@ def robot_folder(folder: Path, path: Path | None, robot: Robot) -> Path:
     return folder if path is None else folder / robot.description.name
 
 
+def data_folder(folder: Path, path: Path | None, robot: Robot) -> Path:
+    """Return `robot_folder`; with a hash of the robot if it has data of another robot."""
+    named, own = robot_folder(folder, path, robot), tree_hash(robot, ROBOT_DIGITS)
+    apart = named.with_name(f"{named.name}-{own[:6]}")
+    if path is None or apart.exists():
+        return named if path is None else apart
+    with suppress(InputError):  # a damaged file is told where it is used
+        for file in sorted(named.rglob("*.npz"))[:1]:
+            return named if read_card(file)["robot"] in (None, own) else apart
+    return named
+
+
 def robot_of(run: Path, request: RunRequest) -> Robot:
     """Load the robot that a run was tuned for.
 
@@ -98,7 +112,7 @@ def flag_folder(args: Collect | Train | Search, name: str, robot: Robot) -> Path
     folder = getattr(args, name)
     if args.is_given(name):
         return folder
-    return robot_folder(Path(folder.parts[0]), args.robot, robot).joinpath(*folder.parts[1:])
+    return data_folder(Path(folder.parts[0]), args.robot, robot).joinpath(*folder.parts[1:])
 
 
 def plants(world: str, seeds: range, description: Description) -> list[Imperfections]:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial, singledispatch
+from pathlib import Path
 from typing import Any
 
 from hector_jax.cli import arguments, doctor, evaluate, flags, propose, tune, verdict, view
@@ -15,13 +16,14 @@ from hector_jax.core.environment import versions
 from hector_jax.core.files import locked, make_folder, write_file, write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
+from hector_jax.core.settings import as_toml
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.report.compare import compare_runs, print_comparison
-from hector_jax.robot.description import description_of
-from hector_jax.robot.model import Robot, load_robot, robot_of
-from hector_jax.robot.propose import as_toml
-from hector_jax.robot.propose import propose as propose_robot
-from hector_jax.robot.table import changes, remarks, table_of, table_of_survey
+from hector_jax.robot.importer.propose import Proposal, standard_form
+from hector_jax.robot.importer.propose import propose as propose_robot
+from hector_jax.robot.importer.remarks import remarks
+from hector_jax.robot.importer.table import changes, table_of
+from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import export, nets, searches, tunings
 from hector_jax.runs.folder import RESULT, load_run, read_request
 from hector_jax.runs.setup import Setup
@@ -142,44 +144,62 @@ def examine_robot(args: flags.Robot) -> None:
         InputError: the robot cannot be used; one line says what must be corrected.
     """
     file, out = args.file, args.out
-    if file.suffix == ".toml":
-        if out is not None:
-            raise InputError(f"--out is for a proposal, and {file} is checked")
-        _print_robot(load_robot(file), [])
-        return
     if out is not None:
         if out.suffix != ".toml":
             raise InputError(f"--out must end in .toml, got {str(out)!r}")
         if out.exists():
             raise InputError(f"--out must be a new file, and {out} exists")
-        folder = file.absolute().parent
-        if out.absolute().parent.resolve() != folder.resolve():
-            raise InputError(f"--out must be beside the model, in {folder}, got {str(out)!r}")
     proposal = propose_robot(file)
+    error = proposal.error or _unfit(proposal.robot)
+    lines, told, is_toml = [], [], file.suffix == ".toml"
+    if proposal.robot is not None:
+        lines, told = table_of(proposal.robot), remarks(proposal.robot)
+        if not error:
+            inputs = proposal.robot, walk_config(proposal.robot), nominal(proposal.robot)
+            lines += _list("delay", margin.delay_lines(*inputs))
+        lines += _list("mended", changes(proposal.robot))
+    if is_toml and proposal.filled:
+        lines += _list("left out", [f"{', '.join(proposal.filled)}: HECTOR's, below by the rules"])
+    print("\n".join([*lines, *_list("wrong", [*told, *proposal.wrong])]))
     head = f"Proposed by `hector robot {file.name}`; rules: docs/howto/robot.md."
-    wrong = [f"To be mended: {line}" for line in proposal.wrong]
-    text = as_toml(proposal.table, [head, *wrong])
-    try:
-        robot = robot_of(description_of(out or file.with_suffix(".toml"), proposal.table))
-    except InputError:
-        print("\n".join([*table_of_survey(proposal.survey), *_list("wrong", proposal.wrong)]))
-        raise
-    _print_robot(robot, proposal.wrong)
-    if out is None:
+    wrong = [*told, *proposal.wrong] if error else proposal.wrong
+    comments = [head, *(f"To be mended: {line}" for line in wrong)]
+    text = as_toml(proposal.table, comments)
+    if out is not None:
+        _write_robot(out, proposal, comments, file)
+        next_step = f"mend it, then: hector robot {out}" if error else "walk with it: hector walk"
+        say(f"the proposal is in {out}; {next_step}{'' if error else f' --robot {out}'}")
+    elif proposal.filled:
         print(f"\n{text}", end="")
-        return
-    write_file(out, text.encode())
-    say(f"the proposal is in {out}; walk with it: hector walk --robot {out}")
+    if error:
+        raise InputError(error)
 
 
-def _print_robot(robot: Robot, wrong: Sequence[str]) -> None:
-    """Print a robot's data, after checking that the controller and the loss can read it."""
-    config = walk_config(robot)
-    loss_of_robot(robot.description)
-    wrong, delay = [*wrong, *remarks(robot)], margin.delay_lines(robot, config, nominal(robot))
-    lists = {"delay": delay, "mended": changes(robot), "wrong": wrong}
-    lines = [line for title, found in lists.items() for line in _list(title, found)]
-    print("\n".join([*table_of(robot), *lines]))
+def _write_robot(out: Path, proposal: Proposal, comments: Sequence[str], file: Path) -> None:
+    """Write a robot in the standard form, or a draft beside a copy of the model that it names."""
+    table, name = proposal.table, str(proposal.table["model"])
+    source, model = file.with_name(name), out.with_name(name)
+    if proposal.wrong:
+        text = source.read_text() if source.exists() and not model.exists() else None
+    else:
+        model = out.with_name(f"{out.stem}-standard.xml")
+        if model.exists():
+            raise InputError(f"--out writes {model}, which must be a new file, and it exists")
+        table, text = standard_form(proposal, model.name)
+    if text is not None:
+        write_file(model, text.encode())
+    write_file(out, as_toml(table, comments).encode())
+
+
+def _unfit(robot: Robot | None) -> str | None:
+    """Return why controller or loss cannot read a robot's settings."""
+    try:
+        if robot is not None:
+            walk_config(robot)
+            loss_of_robot(robot.description)
+    except InputError as error:
+        return str(error)
+    return None
 
 
 def _list(title: str, lines: Sequence[str]) -> list[str]:

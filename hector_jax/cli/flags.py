@@ -26,9 +26,7 @@ class Source(Enum):
     WEIGHTS = "nominal, expert, best or a weights file"
     SETS = "nominal, expert, best, a weights file, or a folder of one for each trajectory"
     TRAJECTORY = "a name or a TOML file"
-    ROBOT = (
-        "a TOML file that names an MJCF (docs/howto/robot.md; `hector robot MODEL` proposes one)"
-    )
+    ROBOT = "a TOML file that names an MJCF: hector robot MODEL --out NAME.toml makes one"
 
 
 def named_file(text: str) -> tuple[str, str]:
@@ -313,11 +311,12 @@ class Walk(Configured):
 class Robot(Flags):
     """Report what a robot's model holds and what is wrong with it, and propose its TOML file.
 
-    Of a TOML file: check it. Example: hector robot h1.xml --out h1.toml
+    Of a TOML file: check it, and fill in what it leaves out.
+    Example: hector robot h1.xml --out h1.toml
     """
 
     file: Annotated[Path, Source.FILE]  # MJCF, URDF, or the TOML file of a robot
-    out: Path | None = None  # file for the proposal, new and beside the model; else it is printed
+    out: Path | None = None  # new file for the proposal, with its model; else it is printed
 
 
 @_command

@@ -138,7 +138,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     config = tunings.tune_config(robot, iterations=args.iterations, others=model_numbers(args.tune))
     config = arguments.with_length(config, trajectories[0])
     start = arguments.weights(args.start, robot)
-    data = arguments.robot_folder(args.data, args.robot, robot)
+    data = arguments.data_folder(args.data, args.robot, robot)
     net = nets.load_net(args.net, robot, args.variant)[0] if args.net else None
     with workers(args.processes) as pool:
         setup = Setup(pool, config, robot, made_with.get("commit", ""))

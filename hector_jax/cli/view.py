@@ -40,7 +40,7 @@ def view_run(args: View) -> None:
     if not args.is_given("sets") and not (args.run / "weights" / f"{after}.json").exists():
         after = "with"  # `best` is chosen at the end of a run
     sets = {name: weights_of(args.run, name, robot) for name in (before, after)}
-    data = arguments.robot_folder(args.data or request.data, request.robot, robot)
+    data = arguments.data_folder(args.data or request.data, request.robot, robot)
     net = request.net if args.data is None and request.net else nets.net_path(data, request.variant)
     effects = {}
     if net.exists():

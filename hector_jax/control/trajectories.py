@@ -132,10 +132,11 @@ def limits(robot: Robot, gait: GaitConfig) -> Limits:
 
     A rule of thumb: during a stance the body moves by half of the leg's reach at standing height;
     the other half remains for balance. Sideways the hip's roll limits the reach, backwards the
-    foot's shorter lever behind the ankle, in a turn the hip's yaw, or without such a joint the way
-    that the feet go sideways. A leg without an ankle ends at its foot point. For HECTOR in MuJoCo
-    (`hfs`, expert weights, 6 s from standing) the estimate is 1.55, 1.04, 1.20 m/s and 3.5 rad/s;
-    it walked at 1.6, 1.0, 1.2 m/s and 4 rad/s, and fell at 1.8, 1.2, 1.5 m/s and 5 rad/s.
+    foot's shorter lever behind the foot point, in a turn the hip's yaw, or without such a joint the
+    way that the feet go sideways. A leg without an ankle ends at its foot point. For HECTOR in
+    MuJoCo (`hfs`, expert weights, 6 s from standing) the estimate is 1.55, 1.04, 1.20 m/s and
+    3.5 rad/s; it walked at 1.6, 1.0, 1.2 m/s and 4 rad/s, and fell at 1.8, 1.2, 1.5 m/s and
+    5 rad/s.
     """
     hip, knee, ankle = knee_joints(robot)
     axis, foot = robot.joint_axis[0], np.asarray(robot.foot_point[0])

@@ -10,7 +10,7 @@ import json
 import math
 import sys
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from numbers import Integral, Real
 from pathlib import Path
@@ -29,6 +29,7 @@ from hector_jax.core.inputs import (
 )
 
 T = TypeVar("T")
+_COLUMNS = 100  # of a line of TOML
 
 
 @dataclass(frozen=True)
@@ -233,3 +234,40 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
 def to_table(settings: Any) -> Any:
     """Convert settings to JSON values that `from_table` reads; a path becomes text."""
     return msgspec.to_builtins(settings, enc_hook=str)
+
+
+def as_toml(table: dict[str, Any], comments: Sequence[str]) -> str:
+    """Return a table as the text of a TOML file that begins with comments."""
+    lines = [f"# {line}" for line in comments]
+    lines += [_line(key, value) for key, value in table.items() if not isinstance(value, dict)]
+    for name, section in table.items():
+        if isinstance(section, dict):
+            nested = section and all(isinstance(value, dict) for value in section.values())
+            parts = {f"{name}.{key}": value for key, value in section.items()} if nested else {}
+            for title, part in (parts or {name: section}).items():
+                lines += ["", f"[{title}]", *(_line(key, value) for key, value in part.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _line(key: str, value: Any) -> str:
+    """Return a key and its value; a long list is wrapped into several lines."""
+    bare = key.replace("_", "").replace("-", "")
+    name = key if bare.isalnum() and bare.isascii() else json.dumps(key)
+    text = f"{name} = {_value(value)}"
+    if len(text) <= _COLUMNS or not isinstance(value, list):
+        return text
+    rows, row = [], ""
+    for item in map(_value, value):
+        if row and len(row) + len(item) + 5 > _COLUMNS:
+            rows.append(row)
+            row = ""
+        row += f"{' ' if row else ''}{item},"
+    return "\n".join([f"{name} = [", *(f"  {r}" for r in (*rows, row)), "]"])
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(map(_value, value))}]"
+    if isinstance(value, float):
+        return f"{value:.10g}" if abs(value) < 1e15 else repr(value)
+    return json.dumps(value)

@@ -1,8 +1,8 @@
 """State, wrench and trajectory, and the only functions that pack a wrench into u.
 
 Everything is in the world frame. A wrench is that of the ground on the robot, at the foot point (on
-the sole, under the ankle axis), in the order of `FEET`. The paper's state is x = [e; p; omega; v;
-g] with 15 entries and its input u = [F_0; F_1; M_0; M_1] with 12 (Eq. 2, 3); f feet have 6 f.
+the sole), in the order of `FEET`. The paper's state is x = [e; p; omega; v; g] with 15 entries
+and its input u = [F_0; F_1; M_0; M_1] with 12 (Eq. 2, 3); f feet have 6 f.
 Arrays are on the host (numpy) or on a device.
 """
 

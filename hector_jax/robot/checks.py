@@ -18,6 +18,7 @@ from hector_jax.robot.description import Description
 
 _TOLERANCE = 1e-6  # [m]: between the contacts of different feet
 ON_FLOOR = 1e-3  # [m]: largest distance of a sole from the floor
+_OVER_FEET = 5e-3  # [m]: of the centre of mass outside the contacts; a point spans no length
 
 
 def check_model(description: Description, model: mujoco.MjModel) -> None:
@@ -84,9 +85,21 @@ def _check_standing(description: Description, model: mujoco.MjModel) -> None:
         expect(path, limits[0] <= angle <= limits[1], text)
     feet, legs = description.named_feet, description.legs
     spheres = [name for foot in feet for name in foot.contacts]
-    for name, height in zip(spheres, lowest_points(data, spheres), strict=True):
+    heights = lowest_points(data, spheres)
+    low, angles = min(heights), not isinstance(description.standing, str)
+    for name, height in zip(spheres, heights, strict=True):
         text = f"{key} has the sole at geom {name!r} {height:.4g} m above the floor, expected 0"
-        expect(path, abs(height) <= ON_FLOOR, text)
+        expect(path, angles or abs(height) <= ON_FLOOR, text)
+    offsets = (f"{name} {1e3 * (h - low):.1f}" for name, h in zip(spheres, heights, strict=True))
+    text = "standing, the soles are not level: contacts above the lowest one [mm]: "
+    text += f"{', '.join(offsets)}; expected at most {1e3 * ON_FLOOR:g}: change the standing angles"
+    expect(path, max(heights) - low <= ON_FLOOR, text)
+    for contact in data.contact:
+        bodies = model.geom_bodyid[contact.geom]
+        sole = any(model.geom(g).name in spheres for g in contact.geom)
+        text = f"{key} has body {model.body(bodies.max()).name!r} {-contact.dist:.3g} m below the "
+        text += "floor, expected nothing there but soles: change the standing angles or the shape"
+        expect(path, sole or bodies.min() or contact.dist > -ON_FLOOR, text)
     x, y, _ = np.array([data.site(foot.point).xpos for foot in feet]).T
     for left in range(0, len(feet), 2):
         text = f"{key} has the {legs[left]} foot at y = {y[left]:.4g}, expected it left of the "
@@ -100,7 +113,8 @@ def _check_standing(description: Description, model: mujoco.MjModel) -> None:
     contacts = np.array([data.geom(name).xpos[:2] for name in spheres])
     low, high = contacts.min(axis=0), contacts.max(axis=0)
     text = f"{key} has the centre of mass at {com}, expected it over the feet, from {low} to {high}"
-    expect(path, np.all(low <= com) and np.all(com <= high), text)
+    over = np.all(low - _OVER_FEET <= com) and np.all(com <= high + _OVER_FEET)
+    expect(path, over, text)
     _check_load(description, data)
 
 

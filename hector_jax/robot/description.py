@@ -10,7 +10,8 @@
     armature = one number per joint    # [kg m^2] of a leg's motors, which a URDF cannot state
     [feet]                             # per leg: names in the model, or points in a body's frame
     left, right = { point = site on the sole, toe = geom, heel = geom }
-    left, right = { body, contacts = [[x, y, z], ...], point = [x, y, z] }   # 1, 2 or 4 contacts
+    left, right = { point = site, contacts = [geom, ...] }                   # 1, 2 or 4 contacts
+    left, right = { body, contacts = [[x, y, z], ...], point = [x, y, z] }   # as many
     [limits]
     min_height, max_tilt               # [m] of the centre of mass, [rad]: beyond them it has fallen
     [gait] [mpc] [footstep] [legs]     # fields of GaitConfig, MpcConfig, FootstepConfig, LegConfig
@@ -45,7 +46,7 @@ LEG_JOINTS = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle")
 FEWEST_JOINTS, MOST_JOINTS = 3, 7  # of a leg
 CONTROL = ("gait", "mpc", "footstep", "legs")  # sections that the controller reads
 
-_MAX_BYTES = 100_000
+MAX_BYTES = 100_000
 
 Triple = tuple[float, float, float]
 
@@ -57,7 +58,7 @@ def _joint_names(side: str) -> tuple[str, ...]:
 class Foot(NamedTuple):
     """A foot in the model's file, by names in it or by points in the frame of a body."""
 
-    point: str | Triple | None  # site; or point where wrenches act [m]; None: under the last joint
+    point: str | Triple | None  # site; or point where wrenches act [m]; None: middle of contacts
     contacts: tuple[str | Triple, ...]  # spheres; or contact points of the sole [m]
     body: str | None = None  # whose frame the points are in
 
@@ -226,28 +227,30 @@ class _Foot:
     toe: str | None = None
     heel: str | None = None
     body: str | None = None
-    contacts: tuple[Triple, ...] = ()
+    contacts: tuple[str | Triple, ...] = ()
 
     def __post_init__(self) -> None:
-        names = [self.point, self.toe, self.heel]
-        if self.body is None:
-            valid = not self.contacts and all(isinstance(name, str) for name in names)
+        point, contacts, body = self.foot
+        named = [isinstance(x, str) for x in contacts]
+        valid = len(contacts) in (1, 2, 4) and not (self.contacts and (self.toe or self.heel))
+        if body is None:
+            valid = valid and all(named) and isinstance(point, str)
         else:
-            points = [*self.contacts, (0.0, 0.0, 0.0) if self.point is None else self.point]
-            valid = len(self.contacts) in (1, 2, 4) and names[1:] == [None, None]
-            valid = valid and not any(isinstance(point, str) for point in points)
-            valid = valid and all(math.isfinite(float(x)) for point in points for x in point)
+            points = [*contacts, (0.0, 0.0, 0.0) if point is None else point]
+            valid = valid and not any(named) and not isinstance(point, str)
+            valid = valid and all(math.isfinite(float(x)) for at in points for x in at)
         if not valid:
             raise InputError(
-                "must be names: point (a site), toe and heel (spheres); or a body with 1, 2 or 4 "
-                "contacts [x, y, z] on its sole and, if wanted, a point [x, y, z]"
+                "must be names: point (a site) and toe and heel (spheres), or point and 1, 2 or 4 "
+                "contacts (spheres); or a body with 1, 2 or 4 contacts [x, y, z] on its sole and, "
+                "if wanted, a point [x, y, z]"
             )
 
     @property
     def foot(self) -> Foot:
         """The foot in the form of the description."""
-        contacts = self.contacts if self.toe is None or self.heel is None else (self.toe, self.heel)
-        return Foot(self.point, contacts, self.body)
+        ends = () if self.toe is None or self.heel is None else (self.toe, self.heel)
+        return Foot(self.point, ends or self.contacts, self.body)
 
 
 @dataclass(frozen=True)
@@ -346,7 +349,7 @@ def read_description(path: Path) -> Description:
         InputError: one line naming the file, the key, the value received and the expected one.
     """
     path = Path(path)
-    return description_of(path, read_toml(path, "the robot description", _MAX_BYTES))
+    return description_of(path, read_toml(path, "the robot description", MAX_BYTES))
 
 
 def description_of(path: Path, table: dict[str, Any]) -> Description:

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 
-MASSLESS = 1e-9  # [kg]: largest mass that `links_of` neglects
+MASSLESS = 1e-6  # [kg]: largest mass that `links_of` neglects
 
 
 class Pose(NamedTuple):
@@ -104,7 +104,8 @@ def data_at(model: mujoco.MjModel, angles: Mapping[Any, float] | None = None) ->
         if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
             data.qpos[start + 3 * (kind == mujoco.mjtJoint.mjJNT_FREE)] = 1.0
     for joint, angle in (angles or {}).items():
-        data.qpos[model.joint(joint).qposadr[0]] = angle
+        if model.jnt_type[model.joint(joint).id] != mujoco.mjtJoint.mjJNT_BALL:
+            data.qpos[model.joint(joint).qposadr[0]] = angle
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     return data

@@ -21,8 +21,8 @@ from hector_jax.robot.checks import expect
 TIME_STEP = 0.001  # [s] of plant, joint control and samples of every robot
 _MOST_BYTES = 1_000_000
 _DEEPEST = 100
-_MOST_BODIES = 200
-_URDF_PARTS = ("link", "joint", "material")  # of a robot; other elements are for other programs
+_MOST_BODIES, _MOST_JOINTS = 2000, 200
+_URDF_PARTS = ("link", "joint", "material", "mujoco")  # of a robot; others are for other programs
 _REFUSED = ("include", "attach", "model", "replicate", "composite", "flexcomp", "plugin")
 
 _COUNT = Range(-1, 1_000_000)  # -1: as many as needed
@@ -31,7 +31,7 @@ _PIXELS = "width height offwidth offheight nrow ncol shadowsize"
 _COUNTS = "njmax nconmax nkey nstack nuserdata "
 _COUNTS += "nuser_body nuser_jnt nuser_geom nuser_site nuser_actuator"
 _RANGES: Mapping[str, Range] = {
-    "diaginertia": POSITIVE,
+    "diaginertia": NOT_NEGATIVE,
     "iterations": Range(1, 1000),
     "ls_iterations": Range(1, 1000),
     "offsamples": Range(0, 64),
@@ -66,17 +66,20 @@ def read_mjcf(path: Path) -> ElementTree.Element:
         raise InputError(f"{path}: root element is <{root.tag[:40]}>, expected <mujoco> or <robot>")
     if root.tag == "robot":
         root[:] = [part for part in root if part.tag in _URDF_PARTS]
-    bodies = 0
+    bodies = joints = 0
     for element, label in _labelled(path, root):
         file = f" of {short_repr(element.get('file'))}" if "file" in element.attrib else ""
         text = f"<{element.tag}>{file} is not accepted, expected one self-contained file"
         expect(path, element.tag not in _REFUSED, text)
         bodies += element.tag in ("body", "link")
+        joints += element.tag in ("joint", "freejoint") and element.get("type") != "fixed"
         for name, value in element.attrib.items():
             if expected := _expected(element.tag, name, value):
                 message = f"{name} is {short_repr(value)}, expected {expected}"
                 raise InputError(f"{path}: {label}: {message}")
     expect(path, bodies <= _MOST_BODIES, f"{bodies} bodies, expected at most {_MOST_BODIES}")
+    text = f"{joints} joints that move, expected at most {_MOST_JOINTS}: fix those of no leg"
+    expect(path, joints <= _MOST_JOINTS, text)
     return root
 
 
@@ -99,6 +102,8 @@ def mujoco_errors(path: Path, root: ElementTree.Element | None = None) -> Iterat
             # MuJoCo quotes unknown names and their context: the first word without a match counts
             unknown = [word for word in re.findall(r"'([^']*)'", message) if word not in names]
             hint = did_you_mean(unknown[0], names) if unknown else ""
+            if "balanceinertia" in message:
+                hint = ': write <compiler balanceinertia="true"/> into <mujoco>, in a URDF too'
         raise InputError(f"{path}: MuJoCo refuses it: {message}{hint}") from None
 
 

@@ -18,11 +18,12 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from hector_jax.core.headless import mujoco
+from hector_jax.core.inputs import InputError
 from hector_jax.robot.checks import check_model, check_soles, standing_data, trunk_body
 from hector_jax.robot.description import DESCRIPTION_PATH, Description, read_description
+from hector_jax.robot.importer.source import build_spec
 from hector_jax.robot.links import data_at, inertia_about
 from hector_jax.robot.mjcf import mujoco_errors
-from hector_jax.robot.source import build_spec
 
 _CLOSED_AXES = np.eye(3)[[2, 0, 1, 1, 1]]  # yaw, roll, hip pitch, knee, ankle
 _TOLERANCE = 1e-6  # [m], [-]: between values of a model that are equal but for rounding
@@ -66,7 +67,7 @@ class Robot(NamedTuple):
     gravity: Float[np.ndarray, "3"]  # pointing up as in the paper [m/s^2]
     joint_origin: Float[np.ndarray, "feet j 3"]  # joint in the frame of the link above [m]
     joint_axis: Float[np.ndarray, "feet j 3"]  # in its own link's frame
-    foot_point: Float[np.ndarray, "feet 3"]  # on the sole under the ankle, in the last link [m]
+    foot_point: Float[np.ndarray, "feet 3"]  # where wrenches act on the sole, in the last link [m]
     sole: Float[np.ndarray, "feet 3 3"]  # takes vectors of a sole (x ahead, z up) to the last link
     link_mass: Float[np.ndarray, "feet j"]  # of the link that each joint moves [kg]
     link_com: Float[np.ndarray, "feet j 3"]  # its CoM in its own frame [m]
@@ -106,17 +107,24 @@ def load_robot(path: Path | None = None) -> Robot:
     Raises:
         InputError: as `describe` and `compile_model`.
     """
-    return robot_of(describe(path))
+    description = describe(path)
+    try:
+        return robot_of(description)
+    except InputError as error:
+        if path is None or Path(path).suffix == ".toml":
+            raise
+        text = f"{error}; unless it is HECTOR's, propose its TOML file first: hector robot {path}"
+        raise InputError(text) from None
 
 
 @quiet_mujoco()
-def robot_of(description: Description) -> Robot:
+def robot_of(description: Description, *, checked: bool = True) -> Robot:
     """Compile the robot of a description and read its constants.
 
     Raises:
-        InputError: as `compile_model`.
+        InputError: as `build_model`.
     """
-    model = compile_model(description)
+    model = build_model(description, checked=checked)[1]
     data = standing_data(description, model)
     trunk = trunk_body(model)
     R_wb = data.xmat[trunk].reshape(3, 3)
@@ -131,7 +139,8 @@ def robot_of(description: Description) -> Robot:
     sole = np.where(np.abs(sole - np.eye(3)).max() <= _TOLERANCE, np.eye(3), sole)  # rounding
     contacts = np.einsum("fij,fcj->fci", sole.mT, spheres)
     contacts[..., 2] -= radius
-    check_soles(description.model, contacts)
+    if checked:
+        check_soles(description.model, contacts)
     toe, heel, half_width = _sole_lengths(contacts)
     contact = {1: "point", 2: "line", 4: "flat"}[contacts.shape[1]]
     robot = Robot(
@@ -163,8 +172,10 @@ def compile_model(description: Description) -> mujoco.MjModel:
 
 
 @quiet_mujoco()
-def build_model(description: Description) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
-    """Return the spec of a description, and its compiled and checked model.
+def build_model(
+    description: Description, *, checked: bool = True
+) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
+    """Return the spec of a description, and its compiled model; unchecked, it need not stand.
 
     Raises:
         InputError: one line with the value received, the expected one and the possible names, from
@@ -173,7 +184,8 @@ def build_model(description: Description) -> tuple[mujoco.MjSpec, mujoco.MjModel
     spec = build_spec(description).spec
     with mujoco_errors(description.model):
         model = spec.compile()
-    check_model(description, model)
+    if checked:
+        check_model(description, model)
     return spec, model
 
 

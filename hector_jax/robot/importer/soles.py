@@ -5,7 +5,8 @@ lie within 5 mm of the lowest one when all joints are zero. If the lowest box of
 this pose, its lower face is the sole; otherwise the sole is level. A sole wider than 2 cm at its
 front and at its back, under a leg of six joints or more, is flat with four corners. Any other sole
 longer than 2 cm is a line from heel to toe, and a shorter one a point. Both feet of a pair get the
-same lengths.
+same lengths. Wrenches act in the middle of the contacts: under an ankle with a short heel the plan
+would have no room behind the foot point.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,9 +19,10 @@ from jaxtyping import Float
 from hector_jax.core.headless import mujoco
 from hector_jax.core.trajectory import FEET
 from hector_jax.robot.checks import expect
+from hector_jax.robot.description import FEWEST_JOINTS
+from hector_jax.robot.importer.rebuild import SHAPES
+from hector_jax.robot.importer.survey import MIN_Y, Survey
 from hector_jax.robot.links import data_at, subtree
-from hector_jax.robot.rebuild import SHAPES
-from hector_jax.robot.survey import Survey
 
 _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = SHAPES
 _SAME_SOLE = 5e-3  # [m] above the lowest point
@@ -37,7 +39,7 @@ class Sole(NamedTuple):
 
     section: dict[str, Any]  # of the TOML
     contacts: Float[np.ndarray, "c 3"]  # in the axes of the sole, from the last joint [m]
-    point: Float[np.ndarray, "3"]  # where wrenches act, in the same frame [m]
+    under: Float[np.ndarray, "3"]  # point of the sole that stands under the centre of mass [m]
     axes: Float[np.ndarray, "3 3"]  # of the sole in the trunk frame, in the pose of `find_soles`
     guessed: bool  # from the foot's inertia: the file has no geoms
 
@@ -54,11 +56,12 @@ def find_soles(survey: Survey, angles: Mapping[str, float] | None = None) -> tup
         InputError: one line: the feet differ.
     """
     data = data_at(survey.model, angles)
-    axes = [_axes(data, leg) for leg in survey.legs]
-    points = [_floor_points(data, leg, R) for leg, R in zip(survey.legs, axes, strict=True)]
+    axes, origins = [_axes(data, leg) for leg in survey.legs], _origins(data, survey.legs)
+    feet = list(zip(survey.legs, origins, axes, strict=True))
+    points = [_floor_points(data, *foot) for foot in feet]
     guessed = not all(map(len, points))
     if guessed:
-        points = [_inertia_box(data, leg) for leg in survey.legs]
+        points = [_inertia_box(data, leg) - origin for leg, origin, _ in feet]
     elif named := _named_soles(survey, data):
         return named
     outlines = [_outline(of_foot, len(survey.legs[0])) for of_foot in points]
@@ -72,8 +75,20 @@ def find_soles(survey: Survey, angles: Mapping[str, float] | None = None) -> tup
         expect(survey.path, same, f"{text}, expected the same")
         mean = np.round(0.5 * (left + right), 4)
         for i, contacts in ((first, mean), (first + 1, _mirrored(mean))):
-            soles.append(_sole(data, survey.legs[i][-1], contacts, axes[i], guessed))
+            joint = survey.legs[i][-1]
+            from_joint = contacts + (origins[i] - data.xanchor[joint]) @ axes[i]
+            soles.append(_sole(data, survey.legs[i], from_joint, axes[i], guessed))
     return tuple(soles)
+
+
+def _origins(data: mujoco.MjData, legs: Sequence[Sequence[int]]) -> list[Float[np.ndarray, "3"]]:
+    """Return a point on each leg's last joint, that of a right leg as mirrored as it can be [m]."""
+    origins = []
+    for left, right in zip(legs[::2], legs[1::2], strict=True):
+        point, axis = data.xanchor[right[-1]], data.xaxis[right[-1]]
+        mirrored = data.xanchor[left[-1]] * [1.0, -1.0, 1.0]
+        origins += [data.xanchor[left[-1]], point + axis @ (mirrored - point) * axis]
+    return origins
 
 
 def _mirrored(contacts: Float[np.ndarray, "c 3"]) -> Float[np.ndarray, "c 3"]:
@@ -112,15 +127,18 @@ def _axes(data: mujoco.MjData, leg: Sequence[int]) -> Float[np.ndarray, "3 3"]:
 
 
 def _floor_points(
-    data: mujoco.MjData, leg: Sequence[int], axes: Float[np.ndarray, "3 3"]
+    data: mujoco.MjData,
+    leg: Sequence[int],
+    origin: Float[np.ndarray, "3"],
+    axes: Float[np.ndarray, "3 3"],
 ) -> Float[np.ndarray, "n 3"]:
-    """Return the points of the sole in its axes, from the last joint."""
+    """Return the points of the sole in its axes, from an origin."""
     geoms = _foot_geoms(data.model, leg)
     if not geoms:
         return np.zeros((0, 3))
     down = -axes[:, 2]
     points = np.concatenate([_support(data, g, down) for g in geoms])
-    points = (points - data.xanchor[leg[-1]]) @ axes
+    points = (points - origin) @ axes
     return points[points[:, 2] <= points[:, 2].min() + _SAME_SOLE]
 
 
@@ -163,27 +181,32 @@ def _outline(points: Float[np.ndarray, "n 3"], joints: int) -> Float[np.ndarray,
     return np.array([[x, y, z] for x, across in ends for y in (across.max(), across.min())])
 
 
-def _inertia_box(data: mujoco.MjData, leg: Sequence[int]) -> Float[np.ndarray, "4 3"]:
-    """Return the lower corners of the box with the mass and inertia of the foot's last body."""
+def _inertia_box(data: mujoco.MjData, leg: Sequence[int]) -> Float[np.ndarray, "n 3"]:
+    """Return the lower corners of the box with the mass and inertia of the foot's last body.
+
+    The last body of three joints is a shank, whose foot is a point: the lower end of its box.
+    """
     model, body = data.model, int(data.model.jnt_bodyid[leg[-1]])
     mass, moments = model.body_mass[body], model.body_inertia[body]
     square = 1.5 * (moments.sum() - 2.0 * moments) / max(mass, 1e-9)
-    half = np.abs(data.ximat[body].reshape(3, 3)) @ np.sqrt(np.maximum(square, 1e-6))
-    center = data.xipos[body] - data.xanchor[leg[-1]]
-    return center + list(product((-1, 1), (-1, 1), (-1.0,))) * half
+    R, half = data.ximat[body].reshape(3, 3), np.sqrt(np.maximum(square, 1e-6))
+    if len(leg) == FEWEST_JOINTS:
+        end = R[:, half.argmax()] * half.max()
+        return (data.xipos[body] - end * np.sign(end[2]))[None]
+    return data.xipos[body] + list(product((-1, 1), (-1, 1), (-1.0,))) * (np.abs(R) @ half)
 
 
 def _sole(
     data: mujoco.MjData,
-    joint: int,
+    leg: Sequence[int],
     contacts: Float[np.ndarray, "c 3"],
     axes: Float[np.ndarray, "3 3"],
     guessed: bool,
 ) -> Sole:
     """Return a sole by points in the frame of the body that the leg's last joint moves."""
+    joint, pitch = leg[-1], [j for j in leg if abs(data.xaxis[j][1]) >= MIN_Y]
     body = int(data.model.jnt_bodyid[joint])
     R, origin = data.xmat[body].reshape(3, 3), data.xpos[body] - data.xanchor[joint]
-    x, middle = contacts[:, 0], 0.5 * (contacts.min(axis=0) + contacts.max(axis=0))
     aligned = np.allclose(np.abs(axes.T @ R).max(axis=0), 1.0, rtol=0.0, atol=1e-9)
     aligned = aligned and np.abs(origin - np.round(origin, 4)).max() <= 1e-9
     digits = 4 if aligned or len(contacts) == 1 else 8  # rounding cannot tilt a single point
@@ -193,12 +216,11 @@ def _sole(
 
     section: dict[str, Any] = {"body": data.model.body(body).name}
     section["contacts"] = [*map(rounded, (contacts @ axes.T - origin) @ R)]
-    point = np.array([0.0, middle[1], middle[2]])
-    if not x.min() < -1e-3 < 1e-3 < x.max():  # the last joint is not above the sole
-        point = middle
-        if len(contacts) > 1:
-            section["point"] = rounded((axes @ point - origin) @ R)
-    return Sole(section, contacts, point, axes, guessed)
+    under = contacts.mean(axis=0)
+    ankle = (data.xanchor[pitch[-1]] - data.xanchor[joint]) @ axes[:, 0]
+    if contacts[:, 0].min() < ankle - 1e-3 < ankle + 1e-3 < contacts[:, 0].max():
+        under[0] = ankle  # whose motor then has least to bear
+    return Sole(section, contacts, under, axes, guessed)
 
 
 def _named_soles(survey: Survey, data: mujoco.MjData) -> tuple[Sole, ...] | None:

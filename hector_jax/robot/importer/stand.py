@@ -1,11 +1,12 @@
 """Find the standing pose of a surveyed robot.
 
-The knees are bent by 1 rad, or as far as their range allows, because a stretched knee is a
-singularity and heavy legs lift the trunk by 2 to 3 cm. The trunk is upright, the soles are level,
-the centre of mass is above the foot points (of four legs each pair of feet is under its hips), and
-all other angles are as small as possible: a least-squares problem in the angles of all legs, solved
-with MuJoCo's kinematics, for any order and direction of the axes. If another joint reaches its
-limit, the knees are bent less.
+The knees are bent by 1 rad from the straight leg, or as far as their range allows, because a
+stretched knee is a singularity and heavy legs lift the trunk by 2 to 3 cm. The trunk is upright,
+the soles are level, the centre of mass is above the ankles, or the middle of soles that do not
+reach under them (of four legs each pair of feet is under its hips), and all other angles are as
+small as possible: a least-squares problem in the angles of all legs, solved with MuJoCo's
+kinematics, for any order and direction of the axes. If another joint reaches its limit, the knees
+are bent less.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,11 +17,12 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from hector_jax.core.headless import mujoco
+from hector_jax.robot.importer.soles import Sole
+from hector_jax.robot.importer.survey import Survey
 from hector_jax.robot.links import data_at
-from hector_jax.robot.soles import Sole
-from hector_jax.robot.survey import Survey
 
 KNEE = 1.0  # [rad] of the first trial
+_NEARLY_STRAIGHT = 0.1  # [rad] of a knee at zero: offsets of a design, which are no bend
 _NEXT_BEND = 0.85  # of the last trial's
 _TRIALS = 9
 _MARGIN = 0.03  # [rad] from the limits
@@ -58,22 +60,25 @@ def _solve(
 ) -> tuple[Float[np.ndarray, " joints"], bool]:
     """Return the angles of all legs for a knee angle [rad], and whether they are a solution."""
     model, data, joints = survey.model, data_at(survey.model, pose), list(sum(survey.legs, ()))
-    feet = []  # body; axes of the sole and foot point in its frame
+    feet = []  # body; axes and point of the sole in its frame
     for leg, sole in zip(survey.legs, soles, strict=True):
         body = int(model.jnt_bodyid[leg[-1]])
         R, anchor = data.xmat[body].reshape(3, 3), data.xanchor[leg[-1]] - data.xpos[body]
-        feet.append((body, R.T @ sole.axes, R.T @ (anchor + sole.axes @ sole.point)))
+        feet.append((body, R.T @ sole.axes, R.T @ (anchor + sole.axes @ sole.under)))
     address, flat = model.jnt_qposadr[joints], len(soles[0].contacts) > 1
     knees = list(range(survey.knee, len(joints), len(survey.legs[0])))
     low, high = _ranges(model, joints)
-    start = np.clip(np.zeros(len(joints)), low, high)
-    for knee, ahead in zip(knees, np.repeat(survey.forwards, 2), strict=True):
+    start = np.zeros(len(joints))
+    for knee, straight, ahead in zip(
+        knees, survey.straight, np.repeat(survey.forwards, 2), strict=True
+    ):
         sign = np.sign(data.xaxis[joints[knee]][1]) * (1.0 if ahead else -1.0)
-        start[knee] = np.clip(sign * bend, low[knee], high[knee])
+        start[knee] = sign * bend + (straight if abs(straight) > _NEARLY_STRAIGHT else 0.0)
+    wanted, start = start, np.clip(start, low, high)
     q, free = start.copy(), [i for i in range(len(joints)) if i not in knees]
 
     def errors(x: Float[np.ndarray, " free"]) -> tuple[np.ndarray, np.ndarray]:
-        """Rotations of the soles from level [rad] and offsets of the foot points in x [m]."""
+        """Rotations of the soles from level [rad] and offsets of the feet in x [m]."""
         q[free] = x
         data.qpos[address] = q
         mujoco.mj_kinematics(model, data)
@@ -95,7 +100,7 @@ def _solve(
     tolerances = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-13)
     result = least_squares(residuals, start[free], bounds=(low[free], high[free]), **tolerances)
     rotation, offset = (np.abs(error).max() for error in errors(result.x))
-    bent = all(abs(abs(q[k]) - bend) < 1e-9 for k in knees) or bend <= 0.5
+    bent = np.allclose(start[knees], wanted[knees], rtol=0, atol=1e-9) or bend <= 0.5
     return q, bool(rotation <= _MAX_ROTATION and offset <= _MAX_OFFSET and bent)
 
 
@@ -104,4 +109,6 @@ def _ranges(model: mujoco.MjModel, joints: Sequence[int]) -> tuple[np.ndarray, n
     limited = model.jnt_limited[joints].astype(bool)
     low, high = model.jnt_range[joints].T
     margin = np.minimum(_MARGIN, 0.1 * (high - low))
-    return np.where(limited, low + margin, -np.pi), np.where(limited, high - margin, np.pi)
+    # ranges of wheels, and those in degrees, go beyond a turn
+    low, high = np.clip([low + margin, high - margin], -2.0 * np.pi, 2.0 * np.pi)
+    return np.where(limited, low, -np.pi), np.where(limited, high, np.pi)

@@ -6,18 +6,20 @@ foot acts; and a keyframe of the standing pose.
 
 Contact bits: 1 floor, 2 first leg, 4 second leg, and so on. Soles touch the floor with their
 spheres only; trunk and legs collide with the floor, so that falls are detected, and the legs with
-each other. Friction and stiffness are those of the floor. A sphere, a cylinder or an ellipsoid that
-collides becomes a capsule of its length and radius. A body without geoms is drawn as a stick.
+each other, except links of which the file excludes all bodies. Friction and stiffness are those of
+the floor. A sphere, a cylinder or an ellipsoid that collides becomes a capsule of its length and
+radius, or the largest box in it if it is a disc. A body without geoms is drawn as a stick.
 """
 
 from collections.abc import Sequence
+from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
-from hector_jax.robot.checks import ON_FLOOR, expect, lowest_points
+from hector_jax.robot.checks import expect, lowest_points
 from hector_jax.robot.description import Description, Foot, NamedFoot
 from hector_jax.robot.links import Link, Pose, pose_of
 from hector_jax.robot.mjcf import TIME_STEP
@@ -55,6 +57,7 @@ _TOUCHES_NOTHING = {"contype": 0, "conaffinity": 0}
 _FLOOR_BITS = {"contype": 0, "conaffinity": 1, "condim": 3}
 _GREY, _DARK = [0.75, 0.78, 0.82, 1.0], [0.1, 0.1, 0.1, 1.0]
 _STICK = 0.02  # [m] radius
+_DISC = 0.7  # largest ratio of the two smaller axes of an ellipsoid that is a disc
 _SHORTEST = 1e-4  # [m] half length of a capsule; Go1's hips are 1.5 mm apart
 
 
@@ -72,7 +75,7 @@ def rebuild(description: Description, pieces: Pieces) -> mujoco.MjSpec:
     """Return the spec, with the names of `Description.named_feet` and `Description.standing_key`.
 
     Raises:
-        InputError: one line: the soles are not level in the standing pose.
+        InputError: one line: the body, site or spheres of a foot are not there.
     """
     spec = mujoco.MjSpec.from_string(_SCENE)
     spec.modelname = description.name
@@ -89,6 +92,7 @@ def rebuild(description: Description, pieces: Pieces) -> mujoco.MjSpec:
         limits = {"ctrllimited": True, "ctrlrange": span, "forcelimited": True, "forcerange": span}
         spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, **limits)
     _add_sticks(pieces, bodies)
+    _add_excludes(spec, pieces)
     for leg in range(len(description.feet)):
         _add_foot(spec, description, pieces, leg)
     _add_standing(spec, description, pieces)
@@ -169,18 +173,33 @@ def _add_geoms(
 def _box_or_capsule(
     shape: int, size: Float[np.ndarray, "3"], pose: Pose
 ) -> tuple[int, Float[np.ndarray, "3"], Pose]:
-    """Return a box or capsule unchanged and the capsule of any other primitive."""
+    """Return a box or capsule unchanged, and of any other primitive a capsule or a disc's box."""
     if shape in (_BOX, _CAPSULE):
         return shape, size, pose
     radius, half = size[0], 0.0
     if shape == _CYLINDER:
         half = size[1] - radius
+        if half < 0.0:
+            return _BOX, np.array([radius, radius, size[1]]) * [*[np.sqrt(0.5)] * 2, 1.0], pose
     elif shape == _ELLIPSOID:
-        longest, radius = int(np.argmax(size)), np.sort(size)[1]
+        longest, (thin, radius, _) = int(np.argmax(size)), np.sort(size)
         half = size[longest] - radius
+        if thin < _DISC * radius:
+            return _BOX, size / np.sqrt(3.0), pose
         # permute the axes so that z becomes the longest one
         pose = pose @ Pose(np.roll(np.eye(3), longest + 1, axis=0))
     return _CAPSULE, np.array([radius, max(half, _SHORTEST), 0.0]), pose
+
+
+def _add_excludes(spec: mujoco.MjSpec, pieces: Pieces) -> None:
+    """Exclude contacts of two links if the file excludes those of all their bodies that collide."""
+    model = pieces.model
+    excluded = {frozenset(divmod(int(pair), 1 << 16)) for pair in model.exclude_signature}
+    collide = set(model.geom_bodyid[(model.geom_contype | model.geom_conaffinity) > 0].tolist())
+    for one, other in combinations(pieces.links, 2):
+        pairs = set(map(frozenset, product(collide & {*one.bodies}, collide & {*other.bodies})))
+        if pairs and pairs <= excluded:
+            spec.add_exclude(bodyname1=one.name, bodyname2=other.name)
 
 
 def _add_sticks(pieces: Pieces, bodies: Sequence) -> None:
@@ -253,28 +272,15 @@ def _add_foot_by_points(
             duplicate.name = ""
         size = [CONTACT_RADIUS, 0.0, 0.0]
         body.add_geom(name=name, type=_SPHERE, size=size, pos=contact + up, **fields)
-    if foot.point is None:
-        level = contacts @ R.T  # world axes, origin at the last joint
-        middle = 0.5 * (level.min(axis=0) + level.max(axis=0))
-        point = R.T @ np.array([0.0 if len(contacts) > 1 else middle[0], *middle[1:]])
-    else:
-        point = pose.p + pose.R @ np.array(foot.point)
+    own = foot.point is not None
+    point = pose.p + pose.R @ np.array(foot.point) if own else contacts.mean(axis=0)
     body.add_site(name=names.point, pos=point, **_SITE)
 
 
 def _add_standing(spec: mujoco.MjSpec, description: Description, pieces: Pieces) -> None:
-    """Add the keyframe of the standing pose, with the lowest contact on the floor.
-
-    Raises:
-        InputError: a contact is more than ON_FLOOR above the lowest one.
-    """
+    """Add the keyframe of the standing pose, with the lowest contact on the floor."""
     names = [name for foot in description.named_feet for name in foot.contacts]
-    heights = lowest_points(_standing_data(spec, pieces), names)
-    low = min(heights)
-    offsets = (f"{name} {1e3 * (h - low):.1f}" for name, h in zip(names, heights, strict=True))
-    text = "standing, the soles are not level: contacts above the lowest one [mm]: "
-    text += f"{', '.join(offsets)}; expected at most {1e3 * ON_FLOOR:g}: change the standing angles"
-    expect(description.model, max(heights) - low <= ON_FLOOR, text)
+    low = min(lowest_points(_standing_data(spec, pieces), names))
     qpos = [0.0, 0.0, -low, *pieces.trunk_quat, *pieces.angles]
     spec.body(pieces.links[0].name).pos = qpos[:3]
     spec.add_key(name=description.standing_key, qpos=qpos)

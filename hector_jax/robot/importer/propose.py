@@ -29,9 +29,7 @@ of mass m and height h:
     min_height               0.55 h
 """
 
-import json
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,11 +39,15 @@ from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import read_toml
 from hector_jax.core.trajectory import FEET
 from hector_jax.robot.checks import standing_data
-from hector_jax.robot.description import Description, description_of
+from hector_jax.robot.description import MAX_BYTES, Description, description_of
+from hector_jax.robot.importer.soles import Sole, find_soles
+from hector_jax.robot.importer.stand import standing_pose
+from hector_jax.robot.importer.survey import Survey, survey_file
 from hector_jax.robot.kinematics import foot_poses
-from hector_jax.robot.model import Robot, compile_model, robot_of
+from hector_jax.robot.model import Robot, build_model, quiet_mujoco, robot_of
 from hector_jax.robot.response import (
     Response,
     planned_inertia,
@@ -53,25 +55,25 @@ from hector_jax.robot.response import (
     swing_frequency,
     trunk_gain,
 )
-from hector_jax.robot.soles import Sole, find_soles
-from hector_jax.robot.stand import standing_pose
-from hector_jax.robot.survey import Survey, survey_file
 
 MASS, HEIGHT = 12.0, 0.423  # of HECTOR [kg], [m]
 _TICK = 0.01  # [s] of the gait
 _ANGLE, _RATE = 50, 1  # weights Q of attitude and angular velocity
 _KP_PER_LIMIT = 2.0  # [1/rad]
+_NAMES = ("name", "model", "standing", "joints", "feet")  # what is found, not ruled
 _ARMATURE_PER_LIMIT = 2e-4  # [s^2]: HECTOR's has 2.4e-4, Unitree's robots 1e-4 to 4e-4
-_COLUMNS = 100
 
 
 class Proposal(NamedTuple):
-    """The proposed TOML of a model's file."""
+    """The proposed TOML of a file, as far as its rules go."""
 
-    survey: Survey
-    soles: tuple[Sole, ...]
     table: dict[str, Any]
     wrong: tuple[str, ...]  # one line per problem to correct by hand
+    filled: list[str]  # keys that the file does not have, which are proposed
+    survey: Survey | None = None  # None: the file names all, or it has no legs
+    soles: tuple[Sole, ...] = ()
+    robot: Robot | None = None  # None: it cannot be built
+    error: str | None = None  # why the robot cannot be used
 
 
 class Size(NamedTuple):
@@ -83,59 +85,119 @@ class Size(NamedTuple):
     inertia: Float[np.ndarray, " joints"]  # at each joint, standing [kg m^2]
 
 
+@quiet_mujoco()
 def propose(path: Path) -> Proposal:
-    """Return the proposed TOML of a model's file.
+    """Return the proposed TOML of a model's file, or of a TOML file with what it leaves out.
 
     Raises:
-        InputError: one line with the missing part of the file and the remedy.
+        InputError: one line with the wrong part of the TOML file.
     """
-    survey = survey_file(path)
+    path = Path(path)
+    own: dict[str, Any] = {"model": path.name}
+    if path.suffix == ".toml":
+        own = read_toml(path, "the robot description", MAX_BYTES)
+        if not isinstance(own.get("model"), str):
+            description_of(path, own)  # refuses it
+    joints, wrong, error = own.get("joints"), [], None
+    joints = joints if isinstance(joints, dict) else {}
+    named = [list(map(str, joints[leg])) for leg in sum(FEET.values(), ()) if leg in joints]
+    stem = "".join(x if x.isalnum() or x in "-_" else "-" for x in path.stem)
+    found = Proposal({"name": stem, **own}, (), [])
+    try:
+        if not (named and "feet" in own and "standing" in own):
+            found = _with_legs(survey_file(path.with_name(own["model"]), named), found)
+            found = _with_feet(found, wrong)
+        names = {key: found.table[key] for key in _NAMES if key in found.table}
+        description = description_of(path.with_suffix(".toml"), names)
+        robot = robot_of(description, checked=False)
+        if armature := _armature(description, robot):
+            names["joints"] = _merged({"armature": armature}, names["joints"])
+            description = description_of(description.path, names)
+        table = _merged(_settings(size_of(description, robot)), found.table | names)
+        description = description_of(description.path, table)
+        found = found._replace(table=table, robot=robot_of(description, checked=False))
+        robot_of(description)
+    except InputError as raised:
+        error = str(raised)
+        wrong.append(error)
+    return found._replace(wrong=tuple(wrong), filled=_left_out(found.table, own), error=error)
+
+
+def standard_form(proposal: Proposal, model: str) -> tuple[dict[str, Any], str]:
+    """Return TOML table and MJCF of a proposed robot in the standard form, which has all names.
+
+    Args:
+        proposal: of a robot that can be used.
+        model: name of the file of the MJCF.
+    """
+    assert proposal.robot is not None
+    description, table = proposal.robot.description, proposal.table
+    joints = {key: x for key, x in table["joints"].items() if key not in ("weld", "armature")}
+    feet = {
+        leg: {"point": foot.point, "contacts": list(foot.contacts)}
+        for leg, foot in zip(description.legs, description.named_feet, strict=True)
+    }
+    named = {"standing": description.standing_key, "joints": joints, "feet": feet}
+    return table | {"model": model} | named, build_model(description)[0].to_xml()
+
+
+def _with_legs(survey: Survey, found: Proposal) -> Proposal:
+    """Return a proposal with the legs of a survey; what its table has stays."""
+    legs = zip(FEET[len(survey.legs)], survey.legs, strict=True)
+    joints: dict[str, Any] = {x: [survey.model.joint(j).name for j in leg] for x, leg in legs}
+    joints |= {"weld": list(survey.weld)} if survey.weld else {}
+    return found._replace(survey=survey, table=_merged({"joints": joints}, found.table))
+
+
+def _with_feet(found: Proposal, wrong: list[str]) -> Proposal:
+    """Return a proposal with feet and standing angles; what its table has stays."""
+    survey = found.survey
+    assert survey is not None
     soles = find_soles(survey)
     angles, balanced = standing_pose(survey, soles)
     if len(soles[0].contacts) == 1:  # a round foot, whose contact moves when the leg bends
         soles = find_soles(survey, angles)
         angles, balanced = standing_pose(survey, soles, angles)
-    table, wrong = _names(survey, soles, angles), []
-    if soles[0].guessed:
+    if soles[0].guessed and "feet" not in found.table:
         wrong.append(
             f"no box, sphere, capsule or cylinder of body {soles[0].section['body']!r} collides: "
             "its contacts are guessed from its inertia: measure the sole and correct "
             f"{' and '.join(f'feet.{leg}' for leg in FEET[len(soles)])}"
         )
-    if not balanced:
+    if not balanced and "standing" not in found.table:
         wrong.append(
             "no standing pose found with level soles and the centre of mass over the feet: correct "
             "the angles of [standing]"
         )
-    description = description_of(Path(path).with_suffix(".toml"), table)
-    try:
-        robot = robot_of(description)
-    except InputError as error:
-        return Proposal(survey, soles, table, (*wrong, str(error)))
-    if armature := _armature(survey, robot):
-        table["joints"]["armature"] = armature
-        description = description_of(description.path, table)
-    table |= _settings(size_of(description, robot))
-    return Proposal(survey, soles, table, tuple(wrong))
+    feet = dict(zip(FEET[len(soles)], (sole.section for sole in soles), strict=True))
+    table = {"standing": angles, "joints": {}, "feet": feet} | found.table
+    return found._replace(soles=soles, table=table)
 
 
-def _names(survey: Survey, soles: Sequence[Sole], angles: dict[str, float]) -> dict[str, Any]:
-    """Return the part of the TOML with names and standing angles."""
-    joints: dict[str, Any] = {}
-    feet = {}
-    for name, leg, sole in zip(FEET[len(soles)], survey.legs, soles, strict=True):
-        joints[name] = [survey.model.joint(j).name for j in leg]
-        feet[name] = sole.section
-    if survey.weld:
-        joints["weld"] = list(survey.weld)
-    stem = "".join(x if x.isalnum() or x in "-_" else "-" for x in survey.path.stem)
-    table = {"name": stem, "model": survey.path.name, "standing": angles}
-    return {**table, "joints": joints, "feet": feet}
+def _merged(rules: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """Return what a table has, and what the rules say where it has nothing."""
+    both = {
+        key: _merged(value, own[key])
+        for key, value in rules.items()
+        if isinstance(value, dict) and isinstance(own.get(key), dict)
+    }
+    return {**{key: x for key, x in own.items() if key not in rules}, **rules, **own, **both}
+
+
+def _left_out(table: dict[str, Any], own: dict[str, Any], prefix: str = "") -> list[str]:
+    """Return the keys of a table that another one does not have."""
+    keys = []
+    for key, value in table.items():
+        if key not in own:
+            keys.append(f"{prefix}{key}")
+        elif isinstance(value, dict):
+            keys += _left_out(value, own[key], f"{prefix}{key}.")
+    return keys
 
 
 def size_of(description: Description, robot: Robot) -> Size:
     """Return the inputs of the rules for a robot."""
-    model = compile_model(description)
+    _, model = build_model(description, checked=False)
     M = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, standing_data(description, model), M)
     mass, height = float(robot.mass), float(robot.standing_height)
@@ -190,11 +252,11 @@ def _settings(size: Size) -> dict[str, Any]:
     }
 
 
-def _armature(survey: Survey, robot: Robot) -> list[float] | None:
-    """Return the armature of a leg's motors [kg m^2], by the rule if the file has none."""
-    leg = list(survey.legs[0])
-    armature = survey.model.dof_armature[survey.model.jnt_dofadr[leg]]
-    default = _ARMATURE_PER_LIMIT * robot.torque_limit[: len(leg)]
+def _armature(description: Description, robot: Robot) -> list[float] | None:
+    """Return the armature of a leg's motors [kg m^2] by the rule, None if the file has all."""
+    count = description.leg_joints
+    armature = build_model(description, checked=False)[1].dof_armature[6 : 6 + count]
+    default = _ARMATURE_PER_LIMIT * robot.torque_limit[:count]
     complete = np.all(armature)
     return None if complete else [_short(x) for x in np.where(armature, armature, default)]
 
@@ -240,40 +302,3 @@ def _weights(size: Size) -> dict[str, Any]:
 def _short(x: float) -> float:
     """Return a number rounded to three digits."""
     return float(f"{x:.3g}")
-
-
-def as_toml(table: dict[str, Any], comments: Sequence[str]) -> str:
-    """Return a table as the text of a TOML file that begins with comments."""
-    lines = [f"# {line}" for line in comments]
-    lines += [_line(key, value) for key, value in table.items() if not isinstance(value, dict)]
-    for name, section in table.items():
-        if isinstance(section, dict):
-            nested = section and all(isinstance(value, dict) for value in section.values())
-            parts = {f"{name}.{key}": value for key, value in section.items()} if nested else {}
-            for title, part in (parts or {name: section}).items():
-                lines += ["", f"[{title}]", *(_line(key, value) for key, value in part.items())]
-    return "\n".join(lines) + "\n"
-
-
-def _line(key: str, value: Any) -> str:
-    """Return a key and its value; a long list is wrapped into several lines."""
-    bare = key.replace("_", "").replace("-", "")
-    name = key if bare.isalnum() and bare.isascii() else json.dumps(key)
-    text = f"{name} = {_value(value)}"
-    if len(text) <= _COLUMNS or not isinstance(value, list):
-        return text
-    rows, row = [], ""
-    for item in map(_value, value):
-        if row and len(row) + len(item) + 5 > _COLUMNS:
-            rows.append(row)
-            row = ""
-        row += f"{' ' if row else ''}{item},"
-    return "\n".join([f"{name} = [", *(f"  {r}" for r in (*rows, row)), "]"])
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, list):
-        return f"[{', '.join(map(_value, value))}]"
-    if isinstance(value, float):
-        return f"{value:.10g}" if abs(value) < 1e15 else repr(value)
-    return json.dumps(value)

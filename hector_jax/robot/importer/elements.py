@@ -2,6 +2,9 @@
 
 Meshes, pictures, sensors, contact pairs and couplings are removed; the files that they name are
 never opened. A body whose mass comes from a mesh, and a coupling of leg joints, are refused.
+
+CAD programs export frames of no mass, whose inertia is rounding: a body of at most MASSLESS has
+none, and a heavier one that is fixed to its parent is a point mass if no body can have its inertia.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -13,12 +16,14 @@ import numpy as np
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import short_repr
 from hector_jax.robot.checks import expect
+from hector_jax.robot.links import MASSLESS
 from hector_jax.robot.mjcf import mujoco_errors
 
 _GEOM = mujoco.mjtGeom
 _MESHES = (_GEOM.mjGEOM_MESH, _GEOM.mjGEOM_SDF, _GEOM.mjGEOM_HFIELD)
+_NO_INERTIA = 1e-12  # [kg m^2], which MuJoCo accepts of any body
 _COUPLINGS = ("equality", "tendon")
-_UNUSED = (*_COUPLINGS, "sensor", "contact", "deformable", "custom")
+_UNUSED = (*_COUPLINGS, "sensor", "deformable", "custom")
 _LINK_PARTS = ("inertial", "visual", "collision")
 _JOINT_PARTS = ("parent", "child", "origin", "axis", "limit", "dynamics")
 
@@ -48,8 +53,17 @@ def spec_of(
             if any(len(part) for part in parts):
                 notes.append(f"<{tag}> is not used")
             _remove(root, parts)
-        for section in root.findall("actuator"):  # not those of tendons, sites, bodies
-            _remove(section, [m for m in section if not {"joint", "jointinparent"} & set(m.attrib)])
+        held = [x for x in root.iter("body") if x.get("gravcomp", "0") != "0"]
+        held += [x for x in root.findall("actuator/*") if {"site", "body"} & {*x.attrib}]
+        names = ", ".join(repr(x.get("name", "")) for x in held)
+        text = f"{names} push bodies (gravcomp, actuators of sites and bodies), expected motors of "
+        expect(path, not held, f"{text}joints alone: remove that")
+        of_joints = {"joint", "jointinparent"}
+        tendons = [x for x in root.findall("actuator/*") if not of_joints & {*x.attrib}]
+        for tag, unused in (("contact", root.findall("contact/pair")), ("actuator", tendons)):
+            notes += [f"<{part.tag}> of <{tag}> is not used" for part in unused[:1]]
+            for section in root.findall(tag):
+                _remove(section, [part for part in section if part in unused])
         for section in root.findall("keyframe"):
             _remove(section, [key for key in section if key.get("name") != keyframe])
             for key in section:
@@ -58,12 +72,28 @@ def spec_of(
     with mujoco_errors(path, root):
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
     removed += _remove_meshes(path, spec)
+    _mend_inertias(path, spec)
     return spec, [*notes, *[f"{removed} meshes and pictures are not read"] * bool(removed)]
 
 
 def _remove(parent: ElementTree.Element, children: Sequence[ElementTree.Element]) -> None:
     for child in children:
         parent.remove(child)
+
+
+def _mend_inertias(path: Path, spec: mujoco.MjSpec) -> None:
+    """Replace the inertias of bodies that have none, see the module's docstring."""
+    for body in spec.bodies[1:]:
+        xx, yy, zz, xy, xz, yz = [*body.inertia] + [0.0] * 3
+        if np.isfinite(body.fullinertia[0]):
+            xx, yy, zz, xy, xz, yz = body.fullinertia
+        least, middle, most = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        fixed = not body.joints and body.parent.name != "world"
+        bad = least <= 0.0 or (fixed and least + middle < most)
+        if body.explicitinertial and (body.mass <= MASSLESS or bad):
+            text = f"body {body.name!r} has moments of inertia from {least:.3g} to {most:.3g}"
+            expect(path, body.mass <= MASSLESS or fixed, f"{text}, expected positive ones")
+            body.fullinertia, body.inertia = np.full(6, np.nan), np.full(3, _NO_INERTIA)
 
 
 def _remove_meshes(path: Path, spec: mujoco.MjSpec) -> int:
@@ -137,7 +167,9 @@ def _clean_urdf(path: Path, root: ElementTree.Element, joints: Sequence[str]) ->
         _remove(material, material.findall("texture"))
     # the root link stays a body, and a link without <inertial> has no mass
     flags = {"fusestatic": "false", "discardvisual": "false", "inertiafromgeom": "false"}
+    own = {name: x for part in root.findall("mujoco/compiler") for name, x in part.attrib.items()}
+    _remove(root, root.findall("mujoco"))
     options = ElementTree.Element("mujoco")
-    ElementTree.SubElement(options, "compiler", flags)
+    ElementTree.SubElement(options, "compiler", own | flags)
     root.insert(0, options)
     return removed

@@ -19,13 +19,15 @@ from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import did_you_mean
 from hector_jax.robot.checks import ON_FLOOR, expect, listed, lowest_points, require
 from hector_jax.robot.description import Description
-from hector_jax.robot.elements import spec_of
-from hector_jax.robot.links import MASSLESS, Link, links_of
+from hector_jax.robot.importer.elements import spec_of
+from hector_jax.robot.importer.rebuild import SHAPES, SOLVER, Pieces, contact_bits, rebuild
+from hector_jax.robot.links import MASSLESS, Link, data_at, links_of
 from hector_jax.robot.mjcf import mujoco_errors, read_mjcf
-from hector_jax.robot.rebuild import SHAPES, SOLVER, Pieces, contact_bits, rebuild
 
 _JOINT = mujoco.mjtJoint
 _MOTOR = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE
+_LISTED = 12  # bodies
+_ENDLESS = 4.0 * np.pi  # [rad] of a range
 _MAX_FRICTION = 0.2  # of the robot's geoms; MuJoCo takes the larger friction of two geoms
 
 
@@ -34,6 +36,8 @@ class Source(NamedTuple):
 
     spec: mujoco.MjSpec
     notes: tuple[str, ...]  # one line per change to the file
+    file: mujoco.MjData  # the file's own bodies in the standing pose
+    links: list[Link]
 
 
 class _File(NamedTuple):
@@ -58,7 +62,7 @@ def build_spec(description: Description) -> Source:
     spec, notes = spec_of(path, root, description.joints, keyframe)
     file = _read(description, root, spec)
     angles, trunk_quat = _standing(file, urdf)
-    limits = [_torque_limit(file, joint) for joint in file.joints]
+    limits = _torque_limits(file)
     fixed = {j: angle for j, angle in angles.items() if j not in file.joints}
     links = links_of(file.model, file.trunk, file.joints, fixed)
     _check_links(description, links)
@@ -67,11 +71,12 @@ def build_spec(description: Description) -> Source:
     for name in options:
         setattr(spec.option, name, SOLVER[name])
     notes += [f"option {listed(options)} set"] * bool(options)
+    standing = data_at(file.model, angles)
     if not changes:
-        return Source(file.spec, (*notes, *_lower_keyframe(file)))
+        return Source(file.spec, (*notes, *_lower_keyframe(file)), standing, links)
     leg_angles = [angles[joint] for joint in file.joints]
     spec = rebuild(description, Pieces(file.model, links, limits, leg_angles, trunk_quat))
-    return Source(spec, (*notes, *changes))
+    return Source(spec, (*notes, *changes), standing, links)
 
 
 def compile_bare(path: Path, root: ElementTree.Element, spec: mujoco.MjSpec) -> mujoco.MjModel:
@@ -118,7 +123,8 @@ def _read(description: Description, root: ElementTree.Element, spec: mujoco.MjSp
 
 def _check_joints(file: _File) -> None:
     """Check that leg joints are hinges with a range, one per body, and all others are welded."""
-    path, model, weld = file.description.model, file.model, file.description.weld
+    description, model = file.description, file.model
+    path, weld = description.model, description.weld
     extra = [
         model.joint(j).name or f"of body {model.body(model.jnt_bodyid[j]).name!r}"
         for j in range(model.njnt)
@@ -126,6 +132,17 @@ def _check_joints(file: _File) -> None:
     ]
     text = f"joints {listed(extra)} are of no leg: add them to weld or remove them"
     expect(path, not extra, text)
+    endless = [
+        model.joint(j).name
+        for j in file.joints
+        if not model.jnt_limited[j] or np.ptp(model.jnt_range[j]) > _ENDLESS
+    ]
+    last = description.joints[description.leg_joints - 1 :: description.leg_joints]
+    text = f"joints {listed(endless)} turn without end, as wheels do, expected feet: fix them"
+    expect(path, not endless or not set(endless) <= set(last), text)
+    without = [name for name in endless if not model.jnt_limited[model.joint(name).id]]
+    text = f"joint {_nor(without)}, expected limits (in a URDF: revolute, lower and upper)"
+    expect(path, not without, text.format("range"))
     for j in file.joints:
         body, joint = int(model.jnt_bodyid[j]), f"joint {model.joint(j).name!r}"
         expect(path, model.jnt_type[j] == _JOINT.mjJNT_HINGE, f"{joint} is not a hinge")
@@ -133,8 +150,6 @@ def _check_joints(file: _File) -> None:
         expect(path, model.body_rootid[body] == file.trunk and body != file.trunk, text)
         text = f"{joint} shares body {model.body(body).name!r} with another joint"
         expect(path, model.body_jntnum[body] == 1, f"{text}, expected a body for each")
-        text = f"{joint} has no range, expected its limits (in a URDF: revolute, lower and upper)"
-        expect(path, model.jnt_limited[j], text)
 
 
 def _check_world(file: _File) -> None:
@@ -183,26 +198,41 @@ def _standing(file: _File, urdf: bool) -> tuple[dict[int, float], Float[np.ndarr
     return angles, trunk_quat
 
 
-def _torque_limit(file: _File, joint: int) -> float:
-    """Return the smallest limit of a joint's torque [N m] that the file states.
+def _torque_limits(file: _File) -> list[float]:
+    """Return the smallest limit of each leg joint's torque [N m] that the file states.
 
     Limits are stated for the forces of its actuators, for the control of a motor and for the joint
     itself (effort in a URDF).
     """
-    name, model, torques = file.model.joint(joint).name, file.model, []
+    model, torques = file.model, {}
+    for joint, name in zip(file.joints, file.description.joints, strict=True):
+        limited = model.jnt_actfrclimited[joint]
+        torques[name] = [np.abs(model.jnt_actfrcrange[joint]).min()] if limited else []
     for motor in _motors(file.spec):
-        if motor.target == name:
+        if (name := motor.target) in torques:
             gear = abs(motor.gear[0])
             if _limited(motor.forcelimited, motor.forcerange):
-                torques.append(gear * np.abs(motor.forcerange).min())
+                torques[name].append(gear * np.abs(motor.forcerange).min())
             if _is_motor(motor) and _limited(motor.ctrllimited, motor.ctrlrange):
-                torques.append(gear * abs(motor.gainprm[0]) * np.abs(motor.ctrlrange).min())
-    if model.jnt_actfrclimited[joint]:
-        torques.append(np.abs(model.jnt_actfrcrange[joint]).min())
-    text = f"joint {name!r} has no torque limit, expected forcerange or ctrlrange of its motor, "
-    text += "actuatorfrcrange of the joint, or effort in a URDF"
-    expect(file.description.model, torques and min(torques) > 0.0, text)
-    return float(min(torques))
+                torques[name].append(gear * abs(motor.gainprm[0]) * np.abs(motor.ctrlrange).min())
+    passive = [name for name, limits in torques.items() if not min(limits, default=0.0) > 0.0]
+    text = f"joint {_nor(passive)}, expected forcerange or ctrlrange of its motor, "
+    text += (
+        "actuatorfrcrange of the joint, or effort in a URDF; a joint that is to have no motor is "
+    )
+    text += "named in joints.weld and not among those of its leg"
+    expect(file.description.model, not passive, text.format("torque limit"))
+    return [float(min(limits)) for limits in torques.values()]
+
+
+def _nor(names: Sequence[str]) -> str:
+    """Return names, the first one with a gap for what it has not.
+
+    >>> _nor(["a", "b", "c"]).format("range")
+    "'a' has no range, nor have b, c"
+    """
+    first, others = repr(next(iter(names), "")), ", ".join(names[1:])
+    return f"{first} has no {{}}" + f", nor have {others}" * bool(others)
 
 
 def _motors(spec: mujoco.MjSpec) -> list:
@@ -225,6 +255,7 @@ def _changes(file: _File, limits: Sequence[float], links: Sequence[Link]) -> lis
     description, model = file.description, file.model
     inside = [b for b in range(1, model.nbody) if model.body_rootid[b] == file.trunk]
     static = [model.body(b).name for b in inside if not model.body_jntnum[b] and b != file.trunk]
+    more = f" and {len(static) - _LISTED} more" if len(static) > _LISTED else ""
     order = [file.free, *file.joints] == list(range(model.njnt))
     at_origin = not np.any(model.jnt_pos) and not np.any(model.qpos0[7:])
     floor, motors = _world_geoms(file), "replace the actuators" if file.spec.actuators else "added"
@@ -232,7 +263,7 @@ def _changes(file: _File, limits: Sequence[float], links: Sequence[Link]) -> lis
     lines = (
         ("free joint added to the trunk", file.free < 0),
         (f"fixed: {listed(description.weld)}", description.weld),
-        (f"made one with their parents: {listed(static)}", static),
+        (f"made one with their parents: {listed(static[:_LISTED])}{more}", static),
         ("joints put in order, leg by leg", file.free >= 0 and not (order or description.weld)),
         ("frames of the joints put into their anchors", not at_origin and order),
         (f"torque motors {motors}", not _motors_match(file, limits)),
