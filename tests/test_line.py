@@ -86,7 +86,7 @@ def test_flags_are_taken_in_any_order_and_spelling():
             "collect --engine warp",
             "invalid choice 'warp' for argument '--engine'. Expected one of ('auto'",
         ),
-        ("walk --robot assets/hector.xml", "`hector robot MODEL` proposes one), got"),
+        ("walk --robot assets/hector.xml", "hector robot MODEL --out NAME.toml makes one, got"),
         (f"walk --weights {300 * 'x'}.json", "cannot read the file: File name too long"),
         (f"tune --resume {300 * 'x'}", "--resume must be the folder of a run of `hector tune`"),
         ("walk --weights exprt", "weights file, got 'exprt'; did you mean 'expert'?"),

@@ -22,7 +22,7 @@ from scipy.optimize import root_scalar
 from hector_jax.core.headless import mujoco
 from hector_jax.robot.checks import standing_data
 from hector_jax.robot.mjcf import TIME_STEP
-from hector_jax.robot.model import Robot, compile_model
+from hector_jax.robot.model import Robot, build_model
 
 DELAY, LAG = 0.005, 0.006  # [s] of the slowest motors that the gains are made for
 PHASE_MARGIN = np.deg2rad(30.0)  # of the loops with these motors
@@ -82,7 +82,7 @@ def response(robot: Robot, stance: Sequence[int] | None = None) -> Response:
     """
     description, feet = robot.description, len(robot.foot_point)
     stands = np.array(stance or ((0,) if feet == 2 else (0, 3)))
-    model = compile_model(description)
+    _, model = build_model(description, checked=False)
     data, nv = standing_data(description, model), model.nv
     M = np.zeros((nv, nv))
     mujoco.mj_fullM(model, data, M)
@@ -173,4 +173,5 @@ def planned_inertia(
     kappa = p * step / (ratio + p * step**2)
     damping = (1.0 + kappa * step) / step
     largest = largest_gain(kappa / (1.0 + kappa * step), tick)
-    return np.minimum(1.0, largest / (damping * gain))
+    answered = np.maximum(gain, 1e-9)  # none about an axis that the legs cannot turn
+    return np.minimum(1.0, largest / (damping * answered))
