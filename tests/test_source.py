@@ -348,17 +348,3 @@ def test_a_wrong_body_of_a_foot_or_order_of_joints_is_refused(tmp_path):
     assert "feet.left.body is 'left_shin'" in refused(small(tmp_path, feet=feet))
     turned = tuple(JOINTS[i] for i in (1, 0, 2, 3, 4, 5, 6, 7))
     assert "name each leg from the trunk down" in refused(small(tmp_path, joints=turned))
-
-
-@pytest.mark.parametrize(
-    ("name", "joints", "contacts"),
-    [("h1", 10, [2, 2]), ("g1", 12, [4, 4]), ("go2", 12, [1] * 4), ("anymal_c", 12, [1] * 4)],
-)
-def test_the_examples_of_published_robots_are_descriptions(name, joints, contacts):
-    """And stand, where the user has put the model beside them."""
-    path = STRIDER.parents[1] / "menagerie" / f"{name}.toml"
-    description = read_description(path)
-    assert len(description.joints) == joints
-    assert [len(foot.contacts) for foot in description.feet] == contacts
-    if description.model.exists():
-        assert compiled(description).nu == joints
