@@ -411,7 +411,11 @@ def test_the_standard_form_is_read_as_it_is_and_is_the_same_robot(monkeypatch, t
     assert build_spec(description).notes == ()
     assert description.standing == description.standing_key
     assert description.weld == description.armature == ()
-    own, robot = propose(model).robot, load_robot(out)
+    proposal = propose(model)
+    own, robot = proposal.robot, load_robot(out)
+    again = propose(tmp_path / "new-standard.xml").table
+    for section, key in (("mpc", "inertia"), ("legs", "kp"), ("legs", "kd")):
+        np.testing.assert_allclose(again[section][key], proposal.table[section][key], rtol=0.02)
     assert robot.structure == own.structure
     assert robot.structure.contact == kind
     for name in own._fields[:-2]:

@@ -113,6 +113,7 @@ def propose(path: Path) -> Proposal:
         if armature := _armature(description, robot):
             names["joints"] = _merged({"armature": armature}, names["joints"])
             description = description_of(description.path, names)
+            robot = robot_of(description, checked=False)
         table = _merged(_settings(size_of(description, robot)), found.table | names)
         description = description_of(description.path, table)
         found = found._replace(table=table, robot=robot_of(description, checked=False))
