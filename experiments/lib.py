@@ -14,9 +14,9 @@ from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree import stack
 from hector_jax.robot.model import Robot
 from hector_jax.runs.cache import content_key, load_or_make
-from hector_jax.sim.loop import Job
 
 Tree = TypeVar("Tree")
+Walk = TypeVar("Walk")  # a job, or what else is walked
 
 
 def write_report(
@@ -72,8 +72,8 @@ def made_at(environment: Mapping[str, str]) -> str:
 
 
 def walk_groups(
-    groups: Mapping[str, Sequence[Job]],
-    walk: Callable[[Sequence[Job]], Iterator[Trajectory]],
+    groups: Mapping[str, Sequence[Walk]],
+    walk: Callable[[Sequence[Walk]], Iterator[Trajectory]],
     score: Callable[[Trajectory], Tree],
     *,
     like: Tree,

@@ -5,10 +5,10 @@ worlds call `step_plan` and `actuate` with measurements. The controller knows on
 robot, never the parameters of the plant.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -120,14 +120,6 @@ class Plan(NamedTuple):
     swing_ticks: Int[Array, "*batch feet"]  # since lift-off
     residual: Float[Array, "*batch"]  # largest relative KKT residual of the QP
     status: Int[Array, "*batch"]  # of the QP, see `qp.Status`
-
-
-class Retune(NamedTuple):
-    """Weights that change during a walk: a carry, and the function for the weights of a tick."""
-
-    init: Any  # carry before t = 0
-    # carry, gait tick, anchor, measurement, wrench commanded over the previous tick
-    step: Callable[[Any, int, Anchor, Measurement, Wrench], tuple[Any, Weights]]
 
 
 def contacts_needed(config: WalkConfig, tick: int) -> int:

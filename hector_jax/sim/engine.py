@@ -87,7 +87,7 @@ DRAKE = _optional_engine(
     "Drake",
     "DrakePlant",
     package="drake",
-    differs="dry friction is smooth, a change of the plant lasts for the whole walk",
+    differs="dry friction is smooth",
 )
 """Drake: compliant contact, solved as a convex problem."""
 
@@ -96,8 +96,7 @@ PINOCCHIO = _optional_engine(
     "Pinocchio",
     "PinocchioPlant",
     package="pin",
-    differs="the floor is rigid, dry friction is smooth, legs pass through each other, a change of "
-    "the plant lasts for the whole walk",
+    differs="the floor is rigid, dry friction is smooth, legs pass through each other",
 )
 """Pinocchio: rigid contact with Coulomb's law."""
 

@@ -20,12 +20,13 @@ import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 
 from hector_jax.control import controller
-from hector_jax.control.controller import Memory, Plan, Retune, WalkConfig
+from hector_jax.control.controller import Memory, Plan, WalkConfig
+from hector_jax.control.legs import Measurement
 from hector_jax.control.parameters import Parameters
 from hector_jax.control.reference import Anchor, anchor_at, standing_anchor, with_pieces
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
-from hector_jax.core.trajectory import Trajectory
+from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.core.tree import Layout, layout, pack, stack, unpack
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot, quiet_mujoco
@@ -38,6 +39,7 @@ from hector_jax.sim.sensing import Ground
 from hector_jax.sim.world import push_force
 
 _measure = jax.jit(sensing.measure)
+Retune = Callable[[int, Anchor, Measurement, Wrench], Weights]
 
 
 @jax.jit
@@ -154,7 +156,8 @@ def walk(
         job: the walk.
         build: builds the plant in an engine.
         retune: returns the weights of plans and legs at each tick from t = 0 on, instead of the
-            job's; called for up to nine ticks after a fall too.
+            job's, from gait tick, anchor, measurement and the wrench commanded over the previous
+            tick; called for up to nine ticks after a fall too.
 
     Returns:
         Samples of 1 ms from t = 0 (numpy). After a fall they repeat the last valid sample and are
@@ -194,7 +197,7 @@ def _walk_blocks(
     packed_anchor, packed_constants, packed_state, packed = map(_pack, trees)
     planner_for = cache(partial(_planner, config, of_constants, of_inputs))
     memory_size = packed.size
-    carry, torques, planner, step = None if retune is None else retune.init, None, None, 0
+    torques, planner, step = None, None, 0
     while step < steps:
         begin, plans, at_start = step, [], []
         for _ in range(_BLOCK if steps - step >= _BLOCK * count else 1):
@@ -205,7 +208,7 @@ def _walk_blocks(
             if retune is not None and planner is not None and tick >= start:
                 measurement, _ = _measure(body, reading, yaw, error)
                 wrench = unpack(planner.layout, np.asarray(packed))[1].wrench
-                carry, weights = retune.step(carry, tick, anchor, measurement, wrench)
+                weights = retune(tick, anchor, measurement, wrench)
                 packed_constants = _pack((body, _parameters(config, weights), *constants[2:]))
             at_start.append((anchor, np.int32(tick), yaw))
             planner = planner_for(controller.contacts_needed(config, tick))
