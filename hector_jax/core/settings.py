@@ -185,13 +185,8 @@ def _decoded(path: Path, language: str, decode: Callable[[], Any]) -> Any:
         return decode()
     except InputError:
         raise
-    except RecursionError:
-        reason = "nested too deeply"
-    except ValueError as error:
-        reason = one_line(error)
-        if "set_int_max_str_digits" in reason:  # advice for programmers, not for users
-            reason = "a number has too many digits"
-    raise InputError(f"{path}: not valid {language}: {reason}")
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not valid {language}: {one_line(error)}") from None
 
 
 def from_table(where: str, kind: type[T], table: Any) -> T:

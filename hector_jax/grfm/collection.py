@@ -141,15 +141,7 @@ def _read_collection(folder: Path) -> tuple[list[Path], dict[str, Any]]:
 
 
 def _load_file(path: Path, robot: Robot) -> Walks:
-    walks = load_tree(path, walks_like(robot), kind="walks", robot=robot)[0]
-    count, ticks = walks.trajectory.fallen.shape
-    for name, tree in (("job", walks.job), ("trajectory", walks.trajectory)):
-        if any(len(leaf) != count for leaf in jax.tree.leaves(tree)):
-            raise InputError(f"{path}: {name} is not of {count} walks, as trajectory.fallen is")
-    by_tick = walks.trajectory._replace(initial=None, period=None)
-    if not count or any(leaf.shape[1] != ticks for leaf in jax.tree.leaves(by_tick)):
-        raise InputError(f"{path}: its walks are not of one length, that of trajectory.fallen")
-    return walks
+    return load_tree(path, walks_like(robot), kind="walks", robot=robot)[0]
 
 
 def _load_if_sound(path: Path, job: Job, robot: Robot, settings: dict[str, Any]) -> Walks | None:

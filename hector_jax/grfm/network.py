@@ -14,7 +14,6 @@ import numpy as np
 
 from hector_jax.control.controller import WalkConfig, walk_config
 from hector_jax.core.inputs import InputError, short_repr
-from hector_jax.core.settings import Range, validation_error
 from hector_jax.core.tree_file import load_tree, read_card, save_tree
 from hector_jax.grfm.effect import Phi
 from hector_jax.grfm.gated import GATED
@@ -26,7 +25,6 @@ VARIANTS = {phi.name: phi for phi in (RESIDUAL, PAPER, GATED, LINEAR)}
 """Every variant by its name; whoever adds one adds it here."""
 
 Params = Any  # of a variant: `Phi.params`
-_MAX_LAYERS, _MAX_WIDTH = 8, 4096  # hidden layers and their units in a file
 
 
 def variant_of(params: Params) -> Phi:
@@ -71,13 +69,6 @@ def read_net_card(path: Path, variant: str | None = None) -> tuple[str, dict[str
     if card["kind"] not in kinds:
         kind = short_repr(card["kind"])[1:-1]
         raise InputError(f"{path}: holds {kind}, expected {' or '.join(kinds)}")
-    hidden = card["about"].get("hidden")
-    sizes = hidden if isinstance(hidden, list) and len(hidden) <= _MAX_LAYERS else [None]
-    if any(validation_error(size, int, Range(1, _MAX_WIDTH)) for size in sizes):
-        raise InputError(
-            f"{path}: about.hidden must be at most {_MAX_LAYERS} whole numbers from 1 to "
-            f"{_MAX_WIDTH}, got {short_repr(hidden)}"
-        )
     return kinds[card["kind"]], card
 
 
