@@ -24,7 +24,7 @@ from hector_jax.control.trajectories import load_command
 from hector_jax.control.weights import expert
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError, did_you_mean, short_repr
-from hector_jax.core.settings import Range, validation_error
+from hector_jax.core.settings import Range, convert
 from hector_jax.core.tree_file import save_tree
 from hector_jax.grfm import collection, network
 from hector_jax.grfm.training import TrainConfig
@@ -101,6 +101,14 @@ def made(kind, **values):
         object.__setattr__(config, field.name, values.get(field.name, default))
     config.__post_init__()
     return config
+
+
+def validation_error(*value):
+    """The message of a value; None if it is valid."""
+    try:
+        convert(*value)
+    except InputError as error:
+        return str(error)
 
 
 @hundreds

@@ -35,7 +35,7 @@ from hector_jax.report.run import write_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import choice, metrics, nets, tunings, verdicts
-from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, Journal, read_object
+from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, read_object
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.runs.walks import Campaign, Row, candidates, changes, tune_on_walks
@@ -242,7 +242,7 @@ def _tune_sets(run: _Run) -> _Tuned:
         run.artefacts,
         title=f"tuning {run.name} without and with GRFM-Net",
         start=run.start,
-        journal=Journal(run.folder / METRICS),
+        metrics=run.folder / METRICS,
     )
     results = {name: entry.tuning for name, entry in done.items()}
     setup, commands = run.setup, list(run.commands.values())

@@ -131,15 +131,6 @@ def _expected(kind: Any, rule: Rule | None = None) -> str:
     return words.get(kind) or f"a {kind.__name__}"
 
 
-def validation_error(value: Any, kind: Any, rule: Rule | None = None) -> str | None:
-    """Return the error message of a value, `must be ..., got ...`; None if it is valid."""
-    try:
-        convert(value, kind, rule)
-    except InputError as error:
-        return str(error)
-    return None
-
-
 def check(settings: Any, /, **rules: Rule) -> None:
     """Check the fields of a dataclass against their types and ranges; for `__post_init__`.
 
