@@ -236,8 +236,11 @@ def _edit(change):
         (lambda t: t["R"].update(force=[[1, 1, 1], [1]]), "R.force must be 2 x 3 numbers, got"),
         (lambda t: t["R"].update(moment=None), "R.moment must be 2 x 3 numbers, got null"),
         (lambda t: t.update(Q=[1, 2]), "Q must be an object"),
-        (lambda t: t.update(others=[1, 2]), r"others must be an object, got \[1, 2\]"),
-        (lambda t: t.update(others={"frition": 1}), "unknown tunable 'frition'; did you mean 'fri"),
+        (lambda t: t.update(others=[1, 2]), "others must be an object; expected"),
+        (
+            lambda t: t.update(others={"frition": 1}),
+            "unknown weight 'others.frition'; did you mean 'others.fri",
+        ),
         (
             lambda t: t.update(others={"friction": 2}),
             "others.friction must be a number from 0.1",

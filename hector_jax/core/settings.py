@@ -162,7 +162,7 @@ def read_json(path: Path, what: str, max_bytes: int = 10_000_000, **options: Any
     return _decoded(path, "JSON", lambda: json.loads(read_text(path, what, max_bytes), **options))
 
 
-def read_toml(path: Path, what: str, max_bytes: int) -> dict[str, Any]:
+def read_toml(path: Path, what: str, max_bytes: int = 10_000_000) -> dict[str, Any]:
     """Read a TOML file with `inputs.read_text`.
 
     Raises:

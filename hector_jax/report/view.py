@@ -113,9 +113,8 @@ def serve(
         port: port to listen on; if it is in use, a free one.
 
     Raises:
-        InputError: viser is not installed, or the server cannot listen on the address.
+        InputError: the server cannot listen on the address.
     """
-    check_viser()
     import viser
 
     # a browser that disconnects early would print a traceback

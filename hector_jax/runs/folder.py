@@ -74,7 +74,7 @@ def load_run(folder: Path) -> Run:
     result, config, made_with = (read_object(folder / name) for name in (RESULT, CONFIG, VERSIONS))
     if not isinstance(result.get("sets"), dict):
         raise InputError(f"{folder / RESULT}: no `sets` in it; expected the result of a tuning")
-    return Run(str(folder), result, read_histories(folder), _flat(config), made_with)
+    return Run(str(folder), result, read_histories(folder), flattened(config), made_with)
 
 
 def read_request(folder: Path) -> RunRequest:
@@ -216,12 +216,12 @@ def read_object(path: Path) -> dict[str, Any]:
     return value
 
 
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return a nested dictionary as a flat dictionary whose names are joined by dots."""
     flat = {}
     for key, value in tree.items():
         name = prefix + key
-        flat |= _flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
+        flat |= flattened(value, f"{name}.") if isinstance(value, dict) else {name: value}
     return flat
 
 
