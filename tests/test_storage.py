@@ -219,7 +219,7 @@ def _edit(change):
         (lambda t: t["Q"].pop("velocity"), 'missing weight "Q.velocity"'),
         (lambda t: t.pop("R"), 'missing weight "R"'),
         (lambda t: t["Q"].update(eular=[1, 1, 1]), "unknown weight 'Q.eular'; did you mean 'Q.eul"),
-        (lambda t: t.update(note="x"), "unknown weight 'note'; known: Q, R"),
+        (lambda t: t.update(note="x"), "unknown weight 'note'.*known: Q, R"),
         (lambda t: t["Q"].update(euler=[1, -1, 1]), r"Q.euler\[1\] must be a number from 1e-12"),
         (lambda t: t["Q"].update(euler=[1, 1, 0]), r"Q.euler\[2\].* to 1e\+12, got 0"),
         (lambda t: t["Q"].update(euler=[1, 1, True]), r"Q.euler\[2\] must be a number.*got True"),

@@ -302,7 +302,7 @@ def actuate(
 
     Source: Eq. 5.
     """
-    target, target_rates = legs.swing_joints(
+    target = legs.swing_joints(
         robot,
         parameters,
         measurement,
@@ -312,11 +312,5 @@ def actuate(
         swing=config.gait.tick * max(config.gait.swing, 1),  # with swing 0 no foot follows its path
     )
     return legs.joint_torques(
-        robot,
-        parameters,
-        measurement,
-        contact=plan.contact,
-        wrench=plan.wrench,
-        target=target,
-        target_rates=target_rates,
+        robot, parameters, measurement, contact=plan.contact, wrench=plan.wrench, target=target
     )

@@ -98,12 +98,10 @@ def load_weights(path: Path, robot: Robot | None = None) -> Weights:
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    tree = dict(pairs)
-    if len(tree) < len(pairs):
-        keys = [key for key, _ in pairs]
-        duplicate = next(key for key in keys if keys.count(key) > 1)
-        raise ValueError(f'"{duplicate}" is given twice')
-    return tree
+    keys = [key for key, _ in pairs]
+    if duplicates := [key for key in keys if keys.count(key) > 1]:
+        raise ValueError(f'"{duplicates[0]}" is given twice')
+    return dict(pairs)
 
 
 def _check_keys(

@@ -91,25 +91,6 @@ def setup_jax() -> None:
     gc.set_threshold(100_000, 20, 100)
 
 
-def all_devices() -> None:
-    """Make every CPU core a JAX device, and join the hosts of a cluster.
-
-    Call after `setup_jax` and before the first array. Hosts are joined if the environment names a
-    coordinator (`JAX_COORDINATOR_ADDRESS`, with `JAX_NUM_PROCESSES` and `JAX_PROCESS_ID` unless JAX
-    detects the cluster) or inside a job step of Slurm or Open MPI.
-    """
-    import jax
-
-    if "host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
-        cores = getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count() or 1))(0)
-        jax.config.update("jax_num_cpu_devices", len(cores))
-    clusters = ("JAX_COORDINATOR_ADDRESS", "SLURM_STEP_NODELIST", "OMPI_MCA_orte_hnp_uri")
-    if any(name in os.environ for name in clusters):
-        variables = ("JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
-        count, rank = (int(os.environ[v]) if v in os.environ else None for v in variables)
-        jax.distributed.initialize(num_processes=count, process_id=rank)
-
-
 class _Process(SpawnProcess):
     """A process with SIGINT blocked, which a terminal sends to all processes of a program."""
 

@@ -105,7 +105,8 @@ def load_walks(folder: Path, robot: Robot) -> Walks:
         InputError: one line naming folder or file: nothing collected, not finished, damaged, or of
             another robot.
     """
-    parts = [_load_file(path, robot) for path in _read_collection(folder)[0]]
+    like, paths = walks_like(robot), _read_collection(folder)[0]
+    parts = [load_tree(path, like, kind="walks", robot=robot)[0] for path in paths]
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
@@ -138,10 +139,6 @@ def _read_collection(folder: Path) -> tuple[list[Path], dict[str, Any]]:
     return paths, settings
 
 
-def _load_file(path: Path, robot: Robot) -> Walks:
-    return load_tree(path, walks_like(robot), kind="walks", robot=robot)[0]
-
-
 def _load_if_sound(path: Path, job: Job, robot: Robot, settings: dict[str, Any]) -> Walks | None:
     if not path.exists():
         return None
@@ -151,7 +148,7 @@ def _load_if_sound(path: Path, job: Job, robot: Robot, settings: dict[str, Any])
         say(f"made anew: {error}")
         return None
     check_settings(path, card["about"].get("settings", {}), settings)
-    walks = _load_file(path, robot)
+    walks, _ = load_tree(path, walks_like(robot), kind="walks", robot=robot)
     if not all(jax.tree.leaves(jax.tree.map(np.array_equal, walks.job, job))):
         raise InputError(f"{path}: collected for other walks; choose another folder or seed")
     return walks

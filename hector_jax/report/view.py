@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import InputError, require_package
+from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.report.motion import COLOURS, INK, Motion
 from hector_jax.report.report import render
@@ -81,15 +81,6 @@ def arrows(motion: Motion, kind: str, source: str) -> Float[np.ndarray, "T feet 
     outwards = np.stack([left, -left] * pairs, axis=1)  # each pair is left, right
     start = motion.feet + _SOURCES[source].offset * motion.height * outwards
     return np.stack([start, start + scale * getattr(motion.wrenches[source], kind)], axis=2)
-
-
-def check_viser() -> None:
-    """Check, before any walk, that the page can be drawn.
-
-    Raises:
-        InputError: viser is not installed.
-    """
-    require_package("viser", "view", "the page", " (--headless writes a film without it)")
 
 
 def serve(

@@ -186,10 +186,10 @@ def tune(
     """
     start = nominal(setup.robot) if start is None else start
     key = partial(content_key, setup.config, setup.robot, start, code=TUNING_CODE)
-    paths = {
-        name: folder / f"tuning-{name}-{key(commands, net, _phi_of(net))}.npz"
-        for name, (commands, net) in problems.items()
-    }
+    paths = {}
+    for name, (commands, net) in problems.items():
+        phi = "" if net is None else function_id(network.variant_of(net).apply)
+        paths[name] = folder / f"tuning-{name}-{key(commands, net, phi)}.npz"
 
     def on_iteration(name: str, iteration: Iteration) -> None:
         if metrics is not None:
@@ -205,11 +205,6 @@ def tune(
     if metrics is not None:
         write_histories(metrics, {n: result.tuning.iterations for n, result in tuned.items()})
     return tuned
-
-
-def _phi_of(net: network.Params | None) -> str:
-    """Return what identifies the functions of a net in the key of a tuning."""
-    return "" if net is None else function_id(network.variant_of(net).apply)
 
 
 def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:

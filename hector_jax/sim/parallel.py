@@ -46,18 +46,9 @@ class _Program:
     places: mjx_model.Places
     last_start: int  # latest start tick of the batch
     ticks: int  # from t = 0
-    fine: bool  # samples of 1 ms
+    substeps: int  # milliseconds in a tick
+    period: int  # milliseconds in a sample
     single: bool  # physics in 32 bits
-
-    @property
-    def substeps(self) -> int:
-        """Milliseconds in a tick."""
-        return substeps(self.config)
-
-    @property
-    def period(self) -> int:
-        """Milliseconds in a sample."""
-        return 1 if self.fine else self.substeps
 
 
 class _Walk(NamedTuple):
@@ -333,6 +324,7 @@ def walk_batch(
         return job._replace(weights=weights, start_tick=start, plant=None)
 
     places, last_start = mjx_model.find_places(worlds[0]), max(int(job.start_tick) for job in jobs)
-    program = _Program(config, places, last_start, ticks, fine, single)
+    count = substeps(config)
+    program = _Program(config, places, last_start, ticks, count, 1 if fine else count, single)
     batch = stack([as_arrays(job) for job in jobs]), varied
     return _in_chunks(batch, len(jobs), chunk, partial(_walk_all, program, robot, model, qpos))

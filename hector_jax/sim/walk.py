@@ -21,12 +21,11 @@ from jax.experimental.xla_metadata import set_xla_metadata
 
 from hector_jax.control import controller
 from hector_jax.control.controller import Memory, Plan, WalkConfig
-from hector_jax.control.legs import Measurement
 from hector_jax.control.parameters import Parameters
 from hector_jax.control.reference import Anchor, anchor_at, standing_anchor, with_pieces
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
-from hector_jax.core.trajectory import Trajectory, Wrench
+from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree import Layout, layout, pack, stack, unpack
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot, quiet_mujoco
@@ -39,7 +38,6 @@ from hector_jax.sim.sensing import Ground
 from hector_jax.sim.world import push_force
 
 _measure = jax.jit(sensing.measure)
-Retune = Callable[[int, Anchor, Measurement, Wrench], Weights]
 
 
 @jax.jit
@@ -146,7 +144,7 @@ def walk(
     job: Job,
     *,
     build: BuildPlant = MujocoPlant,
-    retune: Retune | None = None,
+    retune: Callable[..., Weights] | None = None,
 ) -> Trajectory:
     """Walk once, by default in MuJoCo C.
 
@@ -170,12 +168,24 @@ def walk(
     count, ticks = substeps(config), loop.walk_ticks(config, job.seconds, job.start_tick)
     lead, length = (job.start_tick - first_tick(config)) * count, ticks * count
     plant = build(job, job.body(robot), -lead, length)
-    plans, samples = zip(*_walk_blocks(config, robot, job, plant, ticks, retune), strict=True)
-    return _trajectory(plans, samples, count, lead, length, plant.broken)
+    blocks = zip(*_walk_blocks(config, robot, job, plant, ticks, retune), strict=True)
+    plan, flat = (jax.tree.map(lambda *x: np.concatenate(x), *trees) for trees in blocks)
+    # from a fall on, samples repeat the last valid one
+    fell, good = np.flatnonzero(flat.fallen), len(flat.fallen) - 1
+    if len(fell):
+        good = max(fell[0] - 1, 0)
+    elif plant.broken:  # the engine warned within the last tick and the state does not show it
+        good = max(len(flat.fallen) - count - 1, 0)
+    steps = lead + np.arange(length)
+    rows = np.minimum(steps, good)
+    initial = jax.tree.map(lambda x: x[min(lead - 1, good)], flat.state)
+    plan = jax.tree.map(lambda x: x[rows // count], plan)
+    chosen = jax.tree.map(lambda x: x[rows], flat)._replace(fallen=steps > good)
+    return loop.as_trajectory(np.array(TIME_STEP), initial, plan, chosen)
 
 
 def _walk_blocks(
-    config: WalkConfig, robot: Robot, job: Job, plant: Plant, ticks: int, retune: Retune | None
+    config: WalkConfig, robot: Robot, job: Job, plant: Plant, ticks: int, retune: Any
 ) -> Iterator[tuple[Plan, Sample]]:
     """Yield plans and samples of each block of ticks (numpy), until t = `ticks` or a fall."""
     count, first = substeps(config), first_tick(config)
@@ -232,29 +242,6 @@ def _walk_blocks(
         yield unpack(planner.layout, np.stack(plans))[1], jax.tree.map(np.asarray, samples)
         if plant.broken or np.asarray(samples.fallen).any():
             return
-
-
-def _trajectory(
-    plans: Sequence[Plan],
-    samples: Sequence[Sample],
-    count: int,
-    lead: int,
-    length: int,
-    broken: bool,
-) -> Trajectory:
-    """Return the samples from t = 0 on; from a fall on they repeat the last valid one."""
-    plan, flat = (jax.tree.map(lambda *x: np.concatenate(x), *trees) for trees in (plans, samples))
-    fell, good = np.flatnonzero(flat.fallen), len(flat.fallen) - 1
-    if len(fell):
-        good = max(fell[0] - 1, 0)
-    elif broken:  # the engine warned within the last tick and the state does not show it
-        good = max(len(flat.fallen) - count - 1, 0)
-    steps = lead + np.arange(length)
-    rows = np.minimum(steps, good)
-    initial = jax.tree.map(lambda x: x[min(lead - 1, good)], flat.state)
-    plan = jax.tree.map(lambda x: x[rows // count], plan)
-    chosen = jax.tree.map(lambda x: x[rows], flat)._replace(fallen=steps > good)
-    return loop.as_trajectory(np.array(TIME_STEP), initial, plan, chosen)
 
 
 def on_host(job: Job) -> Job:
