@@ -43,7 +43,7 @@ from hector_jax.core.files import make_folder
 from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
-from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, SEED, validation_error
+from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, SEED, convert
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect
@@ -93,8 +93,7 @@ class Flags:
             ("payload", float, NOT_NEGATIVE),
             ("processes", int, AT_LEAST_ONE),
         ):
-            if error := validation_error(getattr(self, name), kind, allowed):
-                raise InputError(f"Flags.{name} {error}")
+            convert(getattr(self, name), kind, allowed, f"Flags.{name}")
         OnlineConfig(window=self.window, late=self.late)
         count = round(self.seconds / WINDOW)
         if count < 2 or abs(self.seconds - count * WINDOW) > 1e-9:
