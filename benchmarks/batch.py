@@ -22,10 +22,11 @@ import jax
 import numpy as np
 
 from benchmarks.measuring import Check, Report, show
+from experiments.lib import all_devices, sample_weights
 from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.weights import Weights, nominal, sample_weights
+from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.inputs import InputError
-from hector_jax.core.runtime import all_devices, setup_jax
+from hector_jax.core.runtime import setup_jax
 from hector_jax.core.tree import stack
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect, load_net

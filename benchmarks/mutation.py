@@ -44,9 +44,8 @@ PARTS = {
         " batch",
     ),
     "sim": (
-        "sim/actuators sim/changes sim/loop sim/mjx_model sim/parallel sim/sensing sim/walk"
-        " sim/world",
-        "changes sensing world sizes walk engine parallel fidelity",
+        "sim/actuators sim/loop sim/mjx_model sim/parallel sim/sensing sim/walk sim/world",
+        "sensing world sizes walk engine parallel fidelity",
     ),
 }
 COMPARISONS = {"<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "=="}

@@ -25,7 +25,7 @@ import sensitivity
 from jaxtyping import Float, Int
 from sensitivity import Sensitivities, no_tangents, step_sensitivities
 
-from hector_jax.control.controller import Retune, measured_feet
+from hector_jax.control.controller import measured_feet
 from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
 from hector_jax.control.legs import Measurement
 from hector_jax.control.reference import Anchor, Command
@@ -290,19 +290,21 @@ def retuner(
     command: Command,
     effect: jax.tree_util.Partial,
     on_step: Callable[[Iteration], None] = lambda iteration: None,
-) -> Retune:
-    """Return online tuning as a callback of `sim.walk.walk`.
+) -> Callable[..., Weights]:
+    """Return online tuning as a callback of `sim.walk.walk`, for one walk.
 
     Args:
         config, robot, command, effect: see `step_adaptation`.
         weights: the start.
         on_step: called after each window, with the weights in use at its end.
     """
+    carry = init_adaptation(config, weights)
 
-    def step(carry: Adaptation, *tick: Any) -> tuple[Adaptation, Weights]:
+    def retune(*tick: Any) -> Weights:
+        nonlocal carry
         carry, iteration = step_adaptation(config, robot, command, effect, carry, *tick)
         if iteration is not None:
             on_step(iteration)
-        return carry, carry.weights
+        return carry.weights
 
-    return Retune(init_adaptation(config, weights), step)
+    return retune

@@ -22,15 +22,15 @@ import jax.numpy as jnp
 import numpy as np
 import plots
 import tyro
-from lib import write_report
+from lib import all_devices, sample_weights, write_report
 
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
-from hector_jax.control.weights import Weights, expert, nominal, sample_weights
+from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.console import bar, exit_code
 from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError
-from hector_jax.core.runtime import all_devices, setup_jax, workers
+from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, Range, check
 from hector_jax.core.tree import stack
 from hector_jax.grfm import nets

@@ -1,11 +1,16 @@
 """Shared functions of the experiments: cached groups of walks, and the writing of reports."""
 
+import os
 import shlex
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+import jax
+import numpy as np
+
+from hector_jax.control.weights import Weights, direction_names, scale_weights
 from hector_jax.core.console import bar
 from hector_jax.core.environment import environment
 from hector_jax.core.files import write_file, write_json
@@ -14,9 +19,9 @@ from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree import stack
 from hector_jax.robot.model import Robot
 from hector_jax.runs.cache import content_key, load_or_make
-from hector_jax.sim.loop import Job
 
 Tree = TypeVar("Tree")
+Walk = TypeVar("Walk")  # a job, or what else is walked
 
 
 def write_report(
@@ -72,8 +77,8 @@ def made_at(environment: Mapping[str, str]) -> str:
 
 
 def walk_groups(
-    groups: Mapping[str, Sequence[Job]],
-    walk: Callable[[Sequence[Job]], Iterator[Trajectory]],
+    groups: Mapping[str, Sequence[Walk]],
+    walk: Callable[[Sequence[Walk]], Iterator[Trajectory]],
     score: Callable[[Trajectory], Tree],
     *,
     like: Tree,
@@ -117,3 +122,26 @@ def walk_groups(
 
     about = {"settings": [repr(part) for part in settings]}
     return load_or_make(paths, make, like=lambda _: like, kind=kind, robot=robot, about=about)
+
+
+def all_devices() -> None:
+    """Make every CPU core a JAX device, and join the hosts of a cluster.
+
+    Call after `setup_jax` and before the first array. Hosts are joined if the environment names a
+    coordinator (`JAX_COORDINATOR_ADDRESS`, with `JAX_NUM_PROCESSES` and `JAX_PROCESS_ID` unless JAX
+    detects the cluster) or inside a job step of Slurm or Open MPI.
+    """
+    if "host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+        cores = getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count() or 1))(0)
+        jax.config.update("jax_num_cpu_devices", len(cores))
+    clusters = ("JAX_COORDINATOR_ADDRESS", "SLURM_STEP_NODELIST", "OMPI_MCA_orte_hnp_uri")
+    if any(name in os.environ for name in clusters):
+        variables = ("JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
+        count, rank = (int(os.environ[v]) if v in os.environ else None for v in variables)
+        jax.distributed.initialize(num_processes=count, process_id=rank)
+
+
+def sample_weights(weights: Weights, factor: float, count: int) -> list[Weights]:
+    """Draw weight sets log-uniformly within a factor of given weights, with a fixed seed."""
+    draws = np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(direction_names(weights))))
+    return jax.device_get([scale_weights(weights, np.log(factor) * row) for row in draws])

@@ -30,7 +30,8 @@ import jax
 import numpy as np
 import plots
 import tyro
-from adaptation import Adaptation, OnlineConfig, retuner
+from adaptation import OnlineConfig, retuner
+from changes import Change, walk_with_changes
 from lib import check_names, write_report
 from plots import ARMS
 
@@ -42,7 +43,7 @@ from hector_jax.core.files import make_folder
 from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
-from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, SEED, validation_error
+from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, SEED, convert
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect
@@ -50,10 +51,8 @@ from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import nets
 from hector_jax.runs.cache import content_key, load_or_make
-from hector_jax.sim.changes import Change
 from hector_jax.sim.loop import Job
 from hector_jax.sim.standin import standin
-from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, named_world
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
@@ -94,8 +93,7 @@ class Flags:
             ("payload", float, NOT_NEGATIVE),
             ("processes", int, AT_LEAST_ONE),
         ):
-            if error := validation_error(getattr(self, name), kind, allowed):
-                raise InputError(f"Flags.{name} {error}")
+            convert(getattr(self, name), kind, allowed, f"Flags.{name}")
         OnlineConfig(window=self.window, late=self.late)
         count = round(self.seconds / WINDOW)
         if count < 2 or abs(self.seconds - count * WINDOW) > 1e-9:
@@ -145,6 +143,7 @@ def _walk_case(
     config: OnlineConfig,
     robot: Robot,
     job: Job,
+    changes: Sequence[Change],
     effect: jax.tree_util.Partial,
     moment: float,
     arm: str,
@@ -155,17 +154,20 @@ def _walk_case(
     online = retuner(config, robot, job.weights, job.command, effect, steps.append)
     last_tick = round(moment / config.tune.rollout.walk.gait.tick)
 
-    def step(carry: Adaptation, tick: int, *measured: Any) -> tuple[Adaptation, Weights]:
+    weights_in_use = job.weights
+
+    def step(tick: int, *measured: Any) -> Weights:
+        nonlocal weights_in_use
         if arm == "until" and tick >= last_tick:
-            return carry, carry.weights
+            return weights_in_use
         count, start = len(steps), time.process_time()
-        carry, weights = online.step(carry, tick, *measured)
+        weights_in_use = online(tick, *measured)
         if len(steps) > count:
             seconds.append(time.process_time() - start)
-        return carry, weights
+        return weights_in_use
 
-    retune = None if arm == "fixed" else online._replace(step=step)
-    trajectory = walk(config.tune.rollout.walk, robot, job, retune=retune)
+    retune = None if arm == "fixed" else step
+    trajectory = walk_with_changes(config.tune.rollout.walk, robot, job, changes, retune=retune)
     middle, end = round(1e3 * moment), len(trajectory.fallen)
     halves = [_loss(_cut(trajectory, *span)) for span in ((0, middle), (middle, end))]
     spans = [(i, i + round(1e3 * WINDOW)) for i in range(0, end, round(1e3 * WINDOW))]
@@ -223,17 +225,17 @@ def walk_cases(
         imperfections, seed = by_name[case.plant]
         weights = host(starts[case.trajectory, case.start])
         walked = weights, host(named_command(case.trajectory)), host(imperfections)
-        job = Job(*walked, flags.seconds, seed, changes=changes)
+        job = Job(*walked, flags.seconds, seed)
         estimator = case.arm if case.arm in ("cut", "model") else "carried"
         config = replace(default, estimator=estimator)
         effect = effects["command" if case.arm == "plain" else "net"]
-        inputs[case] = config, robot, job, effect, flags.change, case.arm
+        inputs[case] = config, robot, job, changes, effect, flags.change, case.arm
 
     def path(case: Case) -> Path:
-        config, _, job, effect, moment, arm = inputs[case]
+        config, _, job, changes, effect, moment, arm = inputs[case]
         name = "-".join(case).replace(" ", "")
         own = function_id(_walk_case)
-        ending = content_key(config, robot, job, (effect,), moment, arm, own, code=CODE)
+        ending = content_key(config, robot, job, changes, (effect,), moment, arm, own, code=CODE)
         return flags.out / "walks" / f"{name}-{ending}.npz"
 
     def make(missing: Sequence[Case], _: Mapping[Case, Walked]) -> Iterator[tuple[Case, Walked]]:

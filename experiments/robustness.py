@@ -22,6 +22,7 @@ import jax
 import numpy as np
 import plots
 import tyro
+from changes import walk_all, walk_with_changes
 from lib import walk_groups, write_report
 from scenes import (
     PAYLOAD,
@@ -40,6 +41,7 @@ from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import exit_code
 from hector_jax.core.files import make_folder
+from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.trajectory import SOLVED
@@ -50,8 +52,6 @@ from hector_jax.robot.description import HECTOR, Description
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import metrics
 from hector_jax.runs.metrics import Score
-from hector_jax.sim.engine import MUJOCO_C
-from hector_jax.sim.loop import Job
 from hector_jax.sim.standin import FAMILIES
 from hector_jax.sim.world import named_world
 from hector_jax.tuning.loss import loss_of_robot
@@ -149,8 +149,7 @@ def main() -> None:
 
     groups = {
         group(level, name, seed): [
-            Job(sets[name], imperfections=plants[seed], seed=seed, **scene._asdict())
-            for scene in at_level
+            (scene.job(sets[name], plants[seed], seed), scene.changes) for scene in at_level
         ]
         for seed in seeds
         for level, at_level in scenes.items()
@@ -160,13 +159,13 @@ def main() -> None:
     with workers(flags.processes) as pool:
         by_group = walk_groups(
             groups,
-            partial(MUJOCO_C.walk, pool, config, robot),
+            partial(walk_all, pool, config, robot),
             partial(metrics.score, loss),
             like=metrics.score_like(0),
             kind="robustness",
             robot=robot,
             folder=flags.out / "scores",
-            settings=(config, repr(loss)),
+            settings=(config, repr(loss), function_id(walk_with_changes)),
         )
     scores = {
         (level, name): stack([by_group[group(level, name, seed)] for seed in seeds])

@@ -12,17 +12,19 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from changes import TRUNK_TOP, Change
 from jaxtyping import Bool, Float
 
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, UNSEEN, Command, named_command
+from hector_jax.control.weights import Weights
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, check
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.description import HECTOR, PlantSizes
 from hector_jax.runs.metrics import Interval, Score, bootstrap, falls_comparable
-from hector_jax.sim.changes import TRUNK_TOP, Change
-from hector_jax.sim.world import NO_PUSH, Push
+from hector_jax.sim.loop import Job
+from hector_jax.sim.world import NO_PUSH, Imperfections, Push
 
 DIRECTIONS = 45 * np.arange(8)  # [deg] of the pushes, from ahead to the left
 PUSH_START, PUSH_TIME, PUSH_WALK = 0.8, 0.1, 2.5  # [s] the walk includes the recovery
@@ -35,12 +37,16 @@ SLOPES = {"up": (SLOPE, 0.0), "down": (-SLOPE, 0.0), "left": (0.0, SLOPE), "righ
 
 
 class Scene(NamedTuple):
-    """Circumstances of a walk: fields of `Job`, for any weights on any plant."""
+    """Circumstances of a walk, for any weights on any plant."""
 
     command: Command
     seconds: float = 4.0
     push: Push = NO_PUSH
     changes: tuple[Change, ...] = ()
+
+    def job(self, weights: Weights, plant: Imperfections, seed: int) -> Job:
+        """Return the walk of a weight set on a plant, without the changes."""
+        return Job(weights, self.command, plant, self.seconds, seed, push=self.push)
 
 
 class Level(NamedTuple):

@@ -30,7 +30,7 @@ import lib
 import numpy as np
 import plots
 import tyro
-from lib import check_names, write_report
+from lib import check_names, sample_weights, write_report
 
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.legs import LegConfig
@@ -41,7 +41,6 @@ from hector_jax.control.weights import (
     direction_names,
     expert,
     nominal,
-    sample_weights,
     scale_weights,
 )
 from hector_jax.control.weights_file import load_weights

@@ -37,7 +37,6 @@ from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import nets, tunings, verdicts
-from hector_jax.runs.folder import Journal
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Problem
 from hector_jax.sim.world import hfs
@@ -85,7 +84,7 @@ def tuning(folder: Path) -> None:
         {"toy": Problem((S,), None)},
         folder,
         title="",
-        journal=Journal(folder / "metrics.jsonl"),
+        metrics=folder / "metrics.jsonl",
     )
 
 

@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lib import sample_weights
 
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import (
     directions,
     nominal,
-    sample_weights,
     vector_to_weights,
     weights_to_vector,
 )
@@ -304,7 +304,9 @@ def shared_case(kind):
 def test_two_devices_give_the_numbers_of_one(kind):
     here = Path(__file__).parent
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
-    paths = os.pathsep.join([str(here), str(here.parent), os.environ.get("PYTHONPATH", "")])
+    root = here.parent
+    own = map(str, (here, root, root / "experiments"))
+    paths = os.pathsep.join([*own, os.environ.get("PYTHONPATH", "")])
     ran = subprocess.run(
         [sys.executable, "-c", TWO_DEVICES, kind],
         env={**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": paths},
@@ -316,7 +318,8 @@ def test_two_devices_give_the_numbers_of_one(kind):
 
 
 TWO_HOSTS = """
-from hector_jax.core.runtime import all_devices, setup_jax
+from experiments.lib import all_devices
+from hector_jax.core.runtime import setup_jax
 setup_jax()
 all_devices()
 import jax, numpy as np
@@ -337,7 +340,9 @@ def test_two_hosts_give_the_numbers_of_one():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
-    paths = os.pathsep.join([str(here), str(here.parent), os.environ.get("PYTHONPATH", "")])
+    root = here.parent
+    own = map(str, (here, root, root / "experiments"))
+    paths = os.pathsep.join([*own, os.environ.get("PYTHONPATH", "")])
     shared = {"JAX_PLATFORMS": "cpu", "PYTHONPATH": paths, "JAX_COORDINATOR_ADDRESS": address}
     hosts = [
         subprocess.Popen(

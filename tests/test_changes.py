@@ -6,14 +6,13 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from changes import Change, ChangingPlant, changed_world, worlds_by_step
 
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert
 from hector_jax.robot.model import load_robot
-from hector_jax.sim.changes import Change, changed_world, worlds_by_step
 from hector_jax.sim.loop import Job
-from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import build_world, hfs, ideal, standing_qpos
 
@@ -45,8 +44,8 @@ def held(world, steps=400, slide=0.0):
 
 def short(*changes, seconds=0.3, plant=None, on_step=None):
     command = named_command("straight")
-    job = Job(expert(), command, plant or ideal(), seconds, changes=changes)
-    return walk(CONFIG, ROBOT, job, build=partial(MujocoPlant, on_step=on_step))
+    job = Job(expert(), command, plant or ideal(), seconds)
+    return walk(CONFIG, ROBOT, job, build=partial(ChangingPlant, changes=changes, on_step=on_step))
 
 
 @pytest.mark.parametrize("plant", [ideal(), hfs()._replace(trunk_com=np.array([0.01, 0.02, 0.0]))])

@@ -235,10 +235,9 @@ def test_collection_refuses_a_folder_it_cannot_write(monkeypatch, capsys, tmp_pa
 
 
 def test_curves_leave_a_gap_where_a_tick_is_no_sample():
-    whole = at_interval(synthetic_walk(0, 30), 0.01)
-    one = jax.tree.map(lambda x: np.asarray(x)[None], whole)
-    unsolved = np.zeros((1, 30))
-    unsolved[0, 11] = 1.0
+    one = at_interval(synthetic_walk(0, 30), 0.01)
+    unsolved = np.zeros(30)
+    unsolved[11] = 1.0
     curves = fidelity.curves(load_robot(), one, {"residual": last_command})
     gapped = fidelity.curves(
         load_robot(), one._replace(residual=unsolved), {"residual": last_command}

@@ -5,13 +5,14 @@ import json
 import sys
 
 import pytest
+from pretend import pretend_history
 from rich.console import Console
 
 from hector_jax.cli import main as cli
 from hector_jax.cli.flags import Tune
 from hector_jax.cli.parse import as_table, from_file
 from hector_jax.report.compare import compare_runs, print_comparison
-from hector_jax.runs.folder import load_run, read_metrics
+from hector_jax.runs.folder import as_line, load_run, read_histories
 
 
 def change(median, counts=True):
@@ -23,11 +24,6 @@ def verdict(L, falls=0, **changes):
     part = {"mean": L, "low": 0.9 * L, "high": 1.1 * L}
     found = {"L": part, "L_ctrl": part, "falls": falls, "seeds": [0, 1], "scenes": ["c", "s"]}
     return found | {"change": changes}
-
-
-def line(name, iteration, accepted=True, L=1e6):
-    row = {"set": name, "iteration": iteration, "accepted": accepted, "L": L, "step": 0.5}
-    return row | {"weights": {"Q_x": 50.0 + iteration}, "gradient_log": {"Q_x": -1.0}}
 
 
 def run_folder(folder, flags=None, versions=None):
@@ -48,9 +44,8 @@ def run_folder(folder, flags=None, versions=None):
     (folder / "result.json").write_text(json.dumps(result))
     (folder / "config.json").write_text(json.dumps(config))
     (folder / "versions.json").write_text(json.dumps({"jax": "1"} | (versions or {})))
-    lines = [line("with", 0), line("with", 1, accepted=False, L=None), line("with", 2, L=8e5)]
-    lines[2]["gradient"] = {"turn_lead": 3.0}
-    (folder / "metrics.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    lines = [as_line("with", iteration) for iteration in pretend_history(2, refused=(1,))]
+    (folder / "metrics.jsonl").write_text("".join(lines))
     return folder
 
 
@@ -154,4 +149,4 @@ def test_no_run_at_all_is_refused(monkeypatch, capsys):
 def test_a_line_that_is_being_written_is_not_read_yet(runs):
     with (runs[0] / "metrics.jsonl").open("a") as file:
         file.write('{"set": "wi')
-    assert len(read_metrics(runs[0])) == 3
+    assert len(read_histories(runs[0])["with"]) == 3

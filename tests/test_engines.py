@@ -14,10 +14,8 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import InputError
 from hector_jax.robot.model import load_robot
 from hector_jax.runs.metrics import score
-from hector_jax.sim.changes import Change
 from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
@@ -128,13 +126,6 @@ def test_the_feet_carry_the_weight(engine):
     np.testing.assert_allclose(force[-500:].mean(axis=0), [0.0, 0.0, weight], atol=1e-3 * weight)
 
 
-def test_on_a_slope_the_weight_is_tilted(engine):
-    sloping = job(ideal(), changes=(Change(slope=(0.05, 0.0)),))
-    force = held(engine.Plant(sloping, HECTOR, 0, 2000), HECTOR, 2000)
-    weight = 9.81 * float(HECTOR.mass)
-    np.testing.assert_allclose(force[-500:, 0].mean(), weight * np.sin(0.05), rtol=0.05)
-
-
 @pytest.mark.parametrize("plant", WORLDS)
 def test_a_second_of_walking_is_nearly_that_of_mujoco(engine, plant):
     walks = [walked(one, plant) for one in (MujocoPlant, engine.Plant)]
@@ -152,14 +143,6 @@ def test_a_walk_is_the_same_each_time_and_a_push_is_felt_as_in_mujoco(engine):
     (one, here), (again, _) = map(gained, (engine.Plant, engine.Plant))
     jax.tree.map(np.testing.assert_array_equal, one, again)
     assert here == pytest.approx(gained_in_mujoco(), rel=0.1)
-
-
-def test_a_change_on_the_way_is_refused_in_one_line(engine):
-    late = job(ideal(), changes=(Change(start=0.5, payload=2.0),))
-    with pytest.raises(
-        InputError, match=f"engine {engine.name}: a plant cannot change during a walk"
-    ):
-        walk(CONFIG, HECTOR, late, build=engine.Plant)
 
 
 def test_a_fall_is_a_fall(engine):

@@ -12,16 +12,12 @@ import pytest
 from hector_jax.core import runtime
 from hector_jax.robot.model import load_robot
 
-# without the flags of the tests, which a command would try in one more process
+# without the flags of the tests
 USUAL = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-FAST = "--xla_cpu_enable_fast_math=true"
 WRONG = [
     ({"JAX_PLATFORMS": "abacus"}, "JAX does not start with JAX_PLATFORMS=abacus: "),
     ({"JAX_PLATFORMS": "tpu"}, "JAX does not start with JAX_PLATFORMS=tpu: "),
     ({"JAX_NUM_CPU_DEVICES": "x"}, "JAX does not start with JAX_NUM_CPU_DEVICES=x: Invalid value"),
-    ({"XLA_FLAGS": "--nonsense=1"}, "XLA_FLAGS=--nonsense=1: Unknown flag in XLA_FLAGS"),
-    ({"XLA_FLAGS": f"{FAST} --xla_cpu_fast_math_honor_nans=false"}, f"XLA_FLAGS={FAST} "),
-    ({"XLA_FLAGS": f"{FAST} --xla_cpu_fast_math_honor_infs=false"}, f"XLA_FLAGS={FAST} "),
 ]
 
 
@@ -44,24 +40,14 @@ def test_what_jax_cannot_start_with_is_one_line(wrong, line):
     assert said[0].startswith(f"hector: {line}")
 
 
-@pytest.mark.parametrize(("wrong", "line"), WRONG[2:4], ids=["JAX", "XLA"])
-def test_the_doctor_names_what_jax_cannot_start_with(wrong, line):
+def test_the_doctor_names_what_jax_cannot_start_with():
+    wrong, line = WRONG[-1]
     done = hector("doctor", "--json", env=USUAL | wrong)
     assert done.returncode == 1
     (fault,) = json.loads(done.stdout)["faults"]
     assert fault.startswith(line)
     assert f"hector: {line}" in done.stderr
     assert "Traceback" not in done.stderr
-
-
-def test_too_little_memory_is_told_before_anything_hangs():
-    line = "hector: the limit on virtual memory (ulimit -v) is 1.5 GB, expected at least 3 GB\n"
-    for command, code in (("walk", 2), ("doctor", 1)):
-        limited = f'ulimit -v 1500000; exec "$0" -m hector_jax.cli.main {command}'
-        done = subprocess.run(
-            ["bash", "-c", limited, sys.executable], capture_output=True, text=True
-        )
-        assert (done.returncode, done.stderr) == (code, line)
 
 
 def test_a_renderer_is_needed_for_a_film_alone(tmp_path):

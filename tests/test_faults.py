@@ -22,7 +22,6 @@ from hector_jax.core.inputs import InputError
 from hector_jax.report.run import tuning_section
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import tunings
-from hector_jax.runs.folder import Journal
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Problem
 from hector_jax.tuning import rollout
@@ -126,7 +125,7 @@ def tune(command, params, config=CONFIG, robot=ROBOT):
             {"with": Problem((command,), params)},
             Path(kept),
             title="tuning",
-            journal=Journal(Path(kept) / "metrics.jsonl"),
+            metrics=Path(kept) / "metrics.jsonl",
         )
         lines = (Path(kept) / "metrics.jsonl").read_text().splitlines()
     return found["with"].tuning, [json.loads(line) for line in lines]

@@ -4,11 +4,7 @@ Nothing is compiled: loaders and checks alone.
 """
 
 import dataclasses
-import hashlib
-import io
 import json
-import zipfile
-from functools import cache
 from typing import get_args, get_origin
 
 import jax
@@ -28,7 +24,7 @@ from hector_jax.control.trajectories import load_command
 from hector_jax.control.weights import expert
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError, did_you_mean, short_repr
-from hector_jax.core.settings import Range, validation_error
+from hector_jax.core.settings import Range, convert
 from hector_jax.core.tree_file import save_tree
 from hector_jax.grfm import collection, network
 from hector_jax.grfm.training import TrainConfig
@@ -105,6 +101,14 @@ def made(kind, **values):
         object.__setattr__(config, field.name, values.get(field.name, default))
     config.__post_init__()
     return config
+
+
+def validation_error(*value):
+    """The message of a value; None if it is valid."""
+    try:
+        convert(*value)
+    except InputError as error:
+        return str(error)
 
 
 @hundreds
@@ -283,55 +287,12 @@ def test_trajectories_are_taken_or_refused_in_one_line(folder, data):
         assert 0.05 <= found.seconds <= 600.0
 
 
-@cache
-def entries(content):
-    """The arrays of an archive."""
-    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-        return {name: archive[name] for name in archive.files}
-
-
-def forge(path, change_card=lambda card: card, arrays=None):
-    """The archive with another card and other arrays, its hash made to fit."""
-    held = entries(path.read_bytes())
-    card = change_card(json.loads(str(held["card"])))
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for name, array in {**held, **(arrays or {}), "card": np.array(json.dumps(card))}.items():
-            with archive.open(f"{name}.npy", "w") as entry:
-                np.lib.format.write_array(entry, array, allow_pickle=False)
-        archive.comment = b"0" * 64
-    content = buffer.getvalue()[:-64]
-    path.write_bytes(content + hashlib.sha256(content).hexdigest().encode())
-
-
-ARRAYS = st.sampled_from(
-    [
-        np.zeros(0),
-        np.zeros(()),
-        np.full((2, 3), np.nan),
-        np.array("text"),
-        np.zeros(3, complex),
-        np.zeros((1, 1, 1, 1, 1)),
-        np.array(["2020-01-01"], "datetime64[D]"),
-    ]
-)
-
-
 def spoilt(data, path):
-    """A sound file of ours made unsound: its bytes, its card, its arrays, or an array's shape."""
-    shapes = {name: x.shape for name, x in entries(path.read_bytes()).items() if name != "card"}
-    how = data.draw(st.sampled_from(["bytes", "card", "card", "array", "longer"]))
-    if how == "bytes":
-        content = path.read_bytes()
-        other = torn(data, content)
-        assume(other != content)
-        path.write_bytes(other)
-    elif how == "card":
-        forge(path, lambda card: changed(data, card))
-    else:
-        name = data.draw(st.sampled_from(sorted(shapes)))
-        longer = np.ones([size + 1 for size in shapes[name]])
-        forge(path, arrays={name: longer if how == "longer" else data.draw(ARRAYS)})
+    """A sound file of ours with other bytes."""
+    content = path.read_bytes()
+    other = torn(data, content)
+    assume(other != content)
+    path.write_bytes(other)
 
 
 @pytest.fixture(scope="module")
@@ -390,18 +351,6 @@ def test_collected_walks_are_taken_or_refused_in_one_line(folder, walks, data):
         run = found.trajectory
         assert run.state.euler.shape[:2] == run.fallen.shape == run.residual.shape
         assert len(jax.tree.leaves(found.job)[0]) == len(run.fallen)
-
-
-def test_an_archive_that_would_swell_is_refused_unread(folder, net):
-    path = folder / "bomb.npz"
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("card.npy", bytes(10_000_000))
-        archive.comment = b"0" * 64
-    content = buffer.getvalue()[:-64]
-    path.write_bytes(content + hashlib.sha256(content).hexdigest().encode())
-    with pytest.raises(ValueError, match="bomb.npz: no card .*: an entry is compressed"):
-        network.load_net(path, ROBOT)
 
 
 @pytest.mark.parametrize("value", [("weigth",), ("",), ("friction", "kp"), ("foot_height",)])

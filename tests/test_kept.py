@@ -15,7 +15,7 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import metrics, tunings, verdicts
 from hector_jax.runs.cache import content_key
-from hector_jax.runs.folder import Journal, as_line
+from hector_jax.runs.folder import as_line
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Problem, Tuned
 from hector_jax.sim.loop import Job
@@ -112,9 +112,8 @@ def test_metrics_of_a_run_that_was_cut_are_those_of_an_uncut_one(tmp_path, tuned
 
     def lines(folder, problems):
         folder.mkdir(exist_ok=True)
-        lines_of = Journal(folder / "metrics.jsonl")
         setup = Setup(POOL, CONFIG, ROBOT)
-        tunings.tune(setup, problems, folder, title="", journal=lines_of)
+        tunings.tune(setup, problems, folder, title="", metrics=folder / "metrics.jsonl")
         return (folder / "metrics.jsonl").read_text()
 
     whole = lines(tmp_path / "whole", problems)

@@ -53,8 +53,7 @@ def torques(config, state, joints, rates, contact, wrench, target, target_rates)
         Measurement(state, joints, rates),
         contact=contact,
         wrench=wrench,
-        target=target,
-        target_rates=target_rates,
+        target=(target, target_rates),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from adaptation import OnlineConfig, follow, init_trace, retuner
 
-from hector_jax.control.controller import Retune, WalkConfig
+from hector_jax.control.controller import WalkConfig
 from hector_jax.control.legs import Measurement
 from hector_jax.control.parameters import bounds
 from hector_jax.control.reference import named_command, standing_anchor
@@ -152,10 +152,9 @@ def course(monkeypatch, config, follows, windows, start=None):
     start, steps, turn = start or nominal(), [], iter(follows)
     monkeypatch.setattr(adaptation, "follow", lambda *a, **how: next(turn)(*a, **how))
     retune = retuner(config, ROBOT, start, S, last_command, steps.append)
-    carry, weights = retune.init, []
+    weights = []
     for tick in range(config.window * windows + 2):
-        carry, now = retune.step(carry, tick, ANCHOR, MEASURED, zero_wrench())
-        weights.append(now)
+        weights.append(retune(tick, ANCHOR, MEASURED, zero_wrench()))
     return weights, steps
 
 
@@ -237,10 +236,10 @@ def same_bytes(one, other):
 
 def test_a_walk_without_a_gradient_is_the_plain_walk(monkeypatch):
     args = WalkConfig(), ROBOT, Job(nominal(), S, ideal(), 0.3)
-    retune = retuner(OnlineConfig(window=10), ROBOT, nominal(), S, last_command)
     plain = walk(*args)
     for gradient, same in ((vector_to_weights(jnp.zeros(24)), True), (None, False)):
         monkeypatch.setattr(adaptation, "follow", toy(gradient))
+        retune = retuner(OnlineConfig(window=10), ROBOT, nominal(), S, last_command)
         assert same_bytes(plain, walk(*args, retune=retune)) == same
 
 
@@ -249,15 +248,14 @@ def test_the_model_commands_along_the_measured_states_what_the_walk_commanded():
     """What is differentiated is the controller that walked: its commands are found again."""
     seen, told = [], []
 
-    def watch(carry, tick, anchor, measurement, last):
-        seen.append((anchor, measurement, last))
-        return carry, nominal()
+    def watch(tick, *measured):
+        seen.append(measured)
+        return nominal()
 
-    walk(WalkConfig(), ROBOT, Job(nominal(), S, ideal(), 0.45), retune=Retune(None, watch))
+    walk(WalkConfig(), ROBOT, Job(nominal(), S, ideal(), 0.45), retune=watch)
     retune = retuner(OnlineConfig(), ROBOT, nominal(), S, last_command, told.append)
-    carry = retune.init
     for tick, row in enumerate(seen):
-        carry, _ = retune.step(carry, tick, *row)
+        retune(tick, *row)
     commands = stack([last for _, _, last in seen[1:42]])
     change = jax.tree.map(lambda w: jnp.sum(jnp.diff(w, axis=0) ** 2), commands)
     assert float(told[0].evaluation.terms["L_ctrl"]) == pytest.approx(float(sum(change)), rel=1e-6)

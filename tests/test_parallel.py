@@ -16,7 +16,6 @@ from hector_jax.grfm.dataset import at_interval
 from hector_jax.robot.description import MODEL_PATH
 from hector_jax.robot.model import load_robot
 from hector_jax.sim import sensing
-from hector_jax.sim.changes import Change
 from hector_jax.sim.loop import Job, effect_of
 from hector_jax.sim.mjx_model import batched_model, find_places, in_floor, mjx, mjx_contacts
 from hector_jax.sim.mujoco_plant import MujocoPlant
@@ -132,10 +131,6 @@ ONE_PIECE = jax.tree.map(lambda x: x[:1], named_command("s"))
         ([job(expert()), job(expert())._replace(push=NO_PUSH)], "the same shape"),
         ([job(expert(), seconds=0.0)], "at least one tick"),
         ([job(expert()), job(expert(), start_tick=-110)], "start_tick -110 is not later"),
-        (
-            [job(expert()), job(expert())._replace(changes=(Change(payload=2.0),))],
-            r"cannot change, got changes of jobs \[1\]",
-        ),
         ([job(expert(), plant=hfs()._replace(mass=np.array(-1.0)))], "Imperfections.mass"),
     ],
 )

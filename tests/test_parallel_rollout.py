@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lib import sample_weights
 from model import ROBOT, SHORT, small_effect
 
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import (
     nominal,
-    sample_weights,
     vector_to_weights,
     weights_to_vector,
 )

@@ -1,6 +1,5 @@
 """A net is reused only for its own walks and controller; a loss is one number on either engine."""
 
-import ast
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -239,7 +238,7 @@ def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, m
 
 def test_what_takes_the_mean_over_commands_is_in_the_key_of_a_tuning():
     source = environment._source("tuning.difftune").read_bytes()
-    modules = {*tunings.TUNING_CODE, *environment._imported(ast.parse(source))}
+    modules = {*tunings.TUNING_CODE, *environment._syntax(source)[1]}
     assert mean_objective.__module__.removeprefix("hector_jax.") in modules
 
 

@@ -515,8 +515,9 @@ def test_reports_outlive_the_code_and_packages_that_took_them(walked, monkeypatc
 
 
 def test_points_follow_from_the_weights_where_the_code_places_them_otherwise(walked, monkeypatch):
-    unit = campaigns._unit
-    monkeypatch.setattr(campaigns, "_unit", lambda *inputs: 3.0 * unit(*inputs))
+    units = campaigns._units
+    thrice = lambda one: units(one) * np.where(np.arange(len(units(one))) < 18, 1.0, 3.0)  # noqa: E731
+    monkeypatch.setattr(campaigns, "_units", thrice)
     one = campaign(walked)
     space = walks.space_of(HandsOver(), one)
     for number, row in enumerate(rows(walked)):

@@ -24,7 +24,6 @@ from hector_jax.control.reference import UNSEEN
 from hector_jax.control.weights import nominal
 from hector_jax.core.files import as_json
 from hector_jax.core.tree import stack
-from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
 
 ROOT = Path(__file__).parents[1]
@@ -68,8 +67,8 @@ def test_scenes_hold_all_that_may_be_in_the_way():
 
 def test_a_scene_becomes_the_walk_of_a_set_on_a_plant():
     scene = make_scenes(SMALL)[Level("slope", "up")][0]
-    job = Job(nominal(), imperfections=hfs(), seed=7, **scene._asdict())
-    assert (job.seed, job.seconds, job.changes) == (7, scene.seconds, scene.changes)
+    job = scene.job(nominal(), hfs(), 7)
+    assert (job.seed, job.seconds, job.push) == (7, scene.seconds, scene.push)
 
 
 @pytest.mark.parametrize(

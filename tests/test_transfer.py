@@ -6,12 +6,12 @@ import alignment
 import numpy as np
 import pytest
 from alignment import BEYOND_SAG, SAG
+from lib import sample_weights
 
 from hector_jax.control.weights import (
     direction_names,
     directions,
     nominal,
-    sample_weights,
     scale_weights,
     weights_to_vector,
 )

@@ -1,6 +1,7 @@
 """The closed loop in MuJoCo C."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import mujoco
@@ -15,10 +16,11 @@ from hector_jax.core.runtime import workers
 from hector_jax.core.trajectory import State, Wrench
 from hector_jax.core.tree import layout, pack, unpack
 from hector_jax.robot.model import load_robot
-from hector_jax.sim.loop import Job, Sample
+from hector_jax.sim import walk as walks
+from hector_jax.sim.loop import Job, Sample, first_tick
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.standin import standin
-from hector_jax.sim.walk import _trajectory, walk, walk_many
+from hector_jax.sim.walk import walk, walk_many
 from hector_jax.sim.world import Push, build_world, hfs, ideal
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 
@@ -154,23 +156,37 @@ def test_a_fall_is_held_and_marked():
         assert (leaf[first:] == leaf[max(first - 1, 0)]).all()
 
 
-@pytest.mark.parametrize(("fell", "good"), [(1, 0), (2, 1), (5, 4)])
-def test_from_a_fall_on_the_sample_before_it_is_repeated(fell, good):
-    at, zero = np.arange(6.0), np.zeros(6)
+@pytest.mark.parametrize("after", [-1100, 0, 1, 4])
+def test_from_a_fall_on_the_sample_before_it_is_repeated(monkeypatch, after):
+    """A fall in the start-up, or that many milliseconds after t = 0."""
+    lead = 10 * -first_tick(CONFIG)
+    at, fell = np.arange(lead + 50.0), max(lead + after, 0)
+    zero, good = np.zeros_like(at), max(fell - 1, 0)
     state = State(*(at[:, None] * np.ones(3) for _ in range(4)))
     sample = Sample(state, state, Wrench(zero, zero), zero, at, at >= fell, at >= fell)
     plan = Plan(Wrench(zero, zero), zero, None, None, zero, None)
-    walked = _trajectory([plan], [sample], 1, 1, 5, False)
-    np.testing.assert_array_equal(walked.joints, np.minimum(at[1:], good))
-    np.testing.assert_array_equal(walked.fallen, at[1:] >= fell)
+    monkeypatch.setattr(walks, "_walk_blocks", lambda *_: iter([(plan, sample)]))
+    sound = SimpleNamespace(broken=False)
+    job = Job(expert(), named_command("straight"), ideal(), seconds=0.05)
+    walked = walk(CONFIG, ROBOT, job, build=lambda *_: sound)
+    np.testing.assert_array_equal(walked.joints, np.minimum(at[lead:], good))
+    np.testing.assert_array_equal(walked.fallen, at[lead:] > good)
 
 
 class Breaks(MujocoPlant):
     """A plant whose engine warns 33 ms after t = 0."""
 
+    def __init__(self, job, body, first, end):
+        super().__init__(job, body, first, end)
+        self._left = 33 - first
+
+    def step(self, torque, push):  # noqa: D102
+        super().step(torque, push)
+        self._left -= 1
+
     @property
     def broken(self):  # noqa: D102
-        return self._time > 33
+        return self._left < 0
 
 
 def test_a_plant_that_breaks_ends_the_walk_a_tick_before(short):

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from lib import sample_weights
 
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.mpc import MpcConfig
@@ -15,7 +16,6 @@ from hector_jax.control.weights import (
     directions,
     expert,
     nominal,
-    sample_weights,
     scale_weights,
     vector_to_weights,
     weight_names,

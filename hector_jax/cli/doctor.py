@@ -95,7 +95,10 @@ def examine() -> tuple[dict[str, str], list[str]]:
         if trajectory.fallen.any() or not trajectory.residual.max() <= SOLVED
     ]
     try:
-        facts["video"] = f"works ({_film(robot, walks['ideal'])})"
+        with tempfile.TemporaryDirectory() as folder:  # of a film of two frames per second
+            pair = motions(robot, {"one": walks["ideal"], "other": walks["ideal"]})
+            back_end = write_film(Path(folder) / "film.mp4", robot, pair, VideoConfig(rate=2))
+        facts["video"] = f"works ({back_end})"
     except VideoUnavailable as error:
         facts["video"] = str(error)
         if "MUJOCO_GL" in os.environ:  # the user chose a back end
@@ -122,10 +125,3 @@ def _walks(robot: Robot) -> dict[str, Trajectory]:
         "srbm": walk_rigid_body(robot, expert(), command, 2.0),
         "ideal": walk(WalkConfig(), robot, job),
     }
-
-
-def _film(robot: Robot, trajectory: Trajectory) -> str:
-    """Draw a film; return the back end that drew it."""
-    with tempfile.TemporaryDirectory() as folder:
-        pair = motions(robot, {"one": trajectory, "other": trajectory})
-        return write_film(Path(folder) / "film.mp4", robot, pair, VideoConfig(rate=2))

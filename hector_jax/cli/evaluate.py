@@ -179,9 +179,13 @@ def grfm(args: Grfm) -> None:
             report_progress(3 * done + 2, 3 * len(worlds), f"{world}: open loop")
             unpushed = ~np.any(push.force, axis=(1, 2))  # no model contains external pushes
             calm = jax.tree.map(lambda x, unpushed=unpushed: x[unpushed], walks)
-            drifts[world] = fidelity.drifts(robot, effects, calm.trajectory, calm.job.start_tick)
+            drifts[world] = {
+                name: fidelity.drift(robot, effect, calm.trajectory, calm.job.start_tick)
+                for name, effect in {**effects, "measured": None}.items()
+            }
             result[world] = fidelity.as_result(errors, phases, drifts[world])
-    curves = fidelity.curves(robot, worlds["hfs"].trajectory, effects)
+    first = jax.tree.map(lambda x: x[0], worlds["hfs"].trajectory)
+    curves = fidelity.curves(robot, first, effects)
     trainings = {"training": net.history, "training_paper": paper.history}
     tick = config.rollout.walk.gait.tick
     drawings = pictures.of_nets(args.out, tick, curves, drifts, trainings)

@@ -98,8 +98,29 @@ class Configured(Flags):
     config: Path | None = None  # TOML file of flags, or a run's config.json; the line overrides it
 
 
+@dataclass(frozen=True, kw_only=True)
+class Parallel(Flags):
+    """A command that computes in several processes."""
+
+    processes: Processes = 2  # worker processes, one core each
+
+
+@dataclass(frozen=True, kw_only=True)
+class Printed(Flags):
+    """A command that prints a result."""
+
+    json: bool = False  # print JSON instead of text
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForRobot(Flags):
+    """A command for any robot."""
+
+    robot: RobotFile = None  # TOML file of another robot; HECTOR by default
+
+
 @_command
-class Collect(Configured):
+class Collect(Configured, ForRobot, Parallel):
     """Walk on the high-fidelity simulator and record the measured ground forces.
 
     Example: hector collect --walks 128 --out data/more
@@ -110,12 +131,10 @@ class Collect(Configured):
     seconds: Annotated[float, Range(0, 600, above=True)] = 4.0  # length of each walk [s]
     seed: Seed = 0  # seed of all random numbers: commands, weights, plants, pushes
     engine: Engine = "auto"  # c: MuJoCo, one walk per process; mjx: all at once; auto: mjx on a GPU
-    processes: Processes = 2  # worker processes, one core each
-    robot: RobotFile = None  # TOML file of another robot; HECTOR by default
 
 
 @_command
-class Train(Configured):
+class Train(Configured, ForRobot, Printed):
     """Train GRFM-Net on collected walks.
 
     Example: hector train --data data/more --out data/more.npz
@@ -126,12 +145,10 @@ class Train(Configured):
     variant: Variant = "residual"  # architecture of the net
     epochs: Annotated[int, Range(1, 100_000)] = 200  # passes over the samples
     seed: Seed = 0  # seed of the initial parameters and of the order of the samples
-    json: bool = False  # print JSON instead of text
-    robot: RobotFile = None  # TOML file of another robot; HECTOR by default
 
 
 @_command
-class Grfm(Configured):
+class Grfm(Configured, Parallel, Printed):
     """Report how well the nets predict the ground forces of walks that they never saw.
 
     Example: hector grfm --seeds 0
@@ -140,12 +157,10 @@ class Grfm(Configured):
     data: Folder = Path("data")  # folder of the walks and nets, which are made if they are missing
     out: Folder = Path("runs/grfm")  # folder for the report
     seeds: Annotated[int, Range(0, 10_000)] = 2  # stand-in plants, for information; 0: none
-    processes: Processes = 2  # worker processes, one core each
-    json: bool = False  # print JSON instead of text
 
 
 @_command
-class Tune(Configured):
+class Tune(Configured, Parallel):
     """Tune the MPC weights for trajectories, with and without the net, and evaluate them.
 
     Example: hector tune --traj straight c s --seeds 32
@@ -179,13 +194,12 @@ class Tune(Configured):
     walks: Annotated[int, Range(0, 100_000)] = 0
     walk_plants: Annotated[int, Range(0, 1000)] = 2  # drawn plants of these walks; 0: the simulator
     walk_engine: WalkEngine = "c"  # of these walks; c: MuJoCo; extras: drake, pinocchio
-    processes: Processes = 2  # worker processes, one core each
     json: bool = False  # print JSON instead of the table; `run` is the folder
     robot: RobotFile = None  # TOML file of another robot, with its data in DATA/NAME; or HECTOR
 
 
 @_command
-class Propose(Flags):
+class Propose(ForRobot, Parallel, Printed):
     """Say which weights a robot, or a simulator elsewhere, is to walk with next.
 
     Example: hector propose runs/robot --traj s
@@ -197,13 +211,10 @@ class Propose(Flags):
     # weights: Q and R; also footsteps, integral, all, legs, or numbers by name
     tune: tuple[Tunables, ...] = ("weights",)
     seed: Seed = 0  # of the random numbers
-    processes: Processes = 2  # worker processes, one core each
-    json: bool = False  # print JSON instead of text
-    robot: RobotFile = None  # TOML file of another robot; HECTOR by default
 
 
 @_command
-class Report(Flags):
+class Report(Parallel, Printed):
     """Take the logs of the walks with the weights that `hector propose` named.
 
     Example: hector report runs/robot log.npz
@@ -213,12 +224,10 @@ class Report(Flags):
     # one of each trajectory, in their order or as NAME=FILE (docs/howto/walks.md)
     logs: tuple[Annotated[str, Source.LOG], ...] = field(metadata={"or": "undo"})
     undo: bool = False  # take no logs, but take back the last report: its walk is waited for again
-    processes: Processes = 2  # worker processes, one core each
-    json: bool = False  # print JSON instead of text
 
 
 @_command
-class Search(Configured):
+class Search(Configured, ForRobot, Parallel, Printed):
     """Search for weights on the high-fidelity simulator without derivatives (CMA-ES).
 
     Example: hector search --traj s --budget 400
@@ -234,13 +243,10 @@ class Search(Configured):
     engine: Engine = "auto"  # c: MuJoCo, one walk per process; mjx: all at once; auto: mjx on a GPU
     out: Folder = Path("runs/search")  # folder for the best weights, each with a card
     record: Path | None = None  # folder of the record that a search resumes from; by default OUT
-    processes: Processes = 2  # worker processes, one core each
-    json: bool = False  # print JSON instead of text
-    robot: RobotFile = None  # TOML file of another robot; HECTOR by default
 
 
 @_command
-class Evaluate(Configured):
+class Evaluate(Configured, ForRobot, Parallel, Printed):
     """Evaluate weight sets on the plants of a world and print a table.
 
     Example: hector evaluate --traj c --weights nominal expert mine.json
@@ -253,16 +259,13 @@ class Evaluate(Configured):
     seeds: Plants = 8  # number of plants, in the worlds that have several
     first_seed: Seed = 0  # first plant
     out: Path | None = None  # file for the result as JSON
-    processes: Processes = 2  # worker processes, one core each
-    json: bool = False  # print JSON instead of the table
-    robot: RobotFile = None  # TOML file of another robot; HECTOR by default
     plant: RobotFile = None  # TOML file of another model of the robot, of which the plants are
     gait: Gait = "own"  # that of the robot's file, walk, trot, pace, crawl or stand
     engine: OneEngine = "c"  # c: MuJoCo; mjx: it knows its state exactly; extras: drake, pinocchio
 
 
 @_command
-class Verdict(Configured):
+class Verdict(Configured, ForRobot, Parallel, Printed):
     """Evaluate weight sets in several engines and models, and say what may be claimed of them.
 
     Example: hector verdict --weights nominal expert with=runs/tuned --light-heavy
@@ -281,13 +284,10 @@ class Verdict(Configured):
     first_seed: Seed = 0  # first plant
     seconds: Seconds = 4.0  # length of each walk [s]; a whole eight takes 8
     out: Folder = Path("runs/verdict")  # folder for the report; a later call continues there
-    processes: Processes = 2  # worker processes, one core each
-    json: bool = False  # print JSON instead of text
-    robot: RobotFile = None  # TOML file of another robot; HECTOR by default
 
 
 @_command
-class Walk(Configured):
+class Walk(Configured, ForRobot, Printed):
     """Walk once and report losses and tracking errors.
 
     Example: hector walk --traj s --world standin --seed 3 --weights expert --video walk.mp4
@@ -300,8 +300,6 @@ class Walk(Configured):
     seconds: Seconds = 4.0  # length of the walk [s]
     out: Path | None = None  # file for the trajectory (.npz)
     video: Path | None = None  # file for a film beside nominal weights (.mp4; .webp for a page)
-    json: bool = False  # print JSON instead of text
-    robot: RobotFile = None  # TOML file of another robot; HECTOR by default
     plant: RobotFile = None  # TOML file of another model of the robot, which is walked on
     gait: Gait = "own"  # that of the robot's file, walk, trot, pace, crawl or stand
     engine: OneEngine = "c"  # c: MuJoCo; mjx: it knows its state exactly; extras: drake, pinocchio
@@ -320,17 +318,15 @@ class Robot(Flags):
 
 
 @_command
-class Doctor(Flags):
+class Doctor(Printed):
     """Report versions, devices, precision, cache and video of this machine, and test it.
 
     The exit code is 1 if something is broken. Example: hector doctor --json
     """
 
-    json: bool = False  # print JSON instead of text
-
 
 @_command
-class Export(Flags):
+class Export(Printed):
     """Export weights, lines for the open C++ controller, and the compiled controller.
 
     Example: hector export latest
@@ -343,7 +339,6 @@ class Export(Flags):
     traj: Annotated[str | None, Source.TRAJECTORY] = None
     seconds: Seconds = 1.0  # length of that walk after the start-up [s]
     robot: RobotFile = None  # TOML file of the robot of a weights file; HECTOR by default
-    json: bool = False  # print JSON instead of text
 
 
 @_command
@@ -367,7 +362,7 @@ class View(Flags):
 
 
 @_command
-class Compare(Flags):
+class Compare(Printed):
     """Compare finished runs: losses, falls, iterations, versions, settings.
 
     Example: hector compare runs/straight/*
@@ -375,7 +370,6 @@ class Compare(Flags):
 
     runs: tuple[Run, ...]  # folders of runs of `hector tune`, or `latest`
     out: Path | None = None  # file for the comparison as JSON
-    json: bool = False  # print JSON instead of the table
 
 
 def command(word: str) -> type[Any]:

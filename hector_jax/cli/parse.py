@@ -30,7 +30,6 @@ _ABOUT = (
 _HELP = ("-h", "--help")
 _COMPLETION = "--tyro-print-completion"
 _LATEST = Path("latest")  # stands for the newest run
-_MAX_BYTES = 1_000_000
 _NUMBERS: dict[Any, str] = {int: "a whole number", float: "a number"}
 
 Flags = TypeVar("Flags")
@@ -147,12 +146,12 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
             of a wrong type or out of range; or naming the file, if it cannot be read.
     """
     if path.suffix == ".json":
-        content = read_json(path, "flags as JSON", _MAX_BYTES)
+        content = read_json(path, "flags as JSON")
         flags = content.get("flags") if isinstance(content, dict) else None
         if not isinstance(flags, dict):
             raise InputError(f"{path}: no `flags` in it; expected the config.json of a run")
     else:
-        flags = read_toml(path, "flags as TOML", _MAX_BYTES)
+        flags = read_toml(path, "flags as TOML")
     values: dict[str, Any] = {}
     for key, value in flags.items():
         name = key.replace("-", "_")

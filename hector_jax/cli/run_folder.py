@@ -21,7 +21,7 @@ from hector_jax.core.settings import convert
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs.cache import robot_hash
 from hector_jax.runs.campaign import with_leg_numbers
-from hector_jax.runs.folder import CONFIG, VERSIONS, read_object
+from hector_jax.runs.folder import CONFIG, VERSIONS, flattened, read_object
 from hector_jax.runs.nets import COLLECTION_CODE
 from hector_jax.sim.engine import choose_engine
 
@@ -162,14 +162,10 @@ def check_agreement(folder: Path, recorded: Mapping[str, Any], current: Mapping[
     Raises:
         InputError: one line naming the folder and the first setting that differs.
     """
-    for name, value in current.items():
-        if isinstance(value, dict):
-            old = recorded.get(name, {})
-            if not isinstance(old, dict):
-                raise InputError(f"{folder / CONFIG}: {name}: no settings: {old!r}")
-            check_agreement(folder, old, value)
-        elif recorded.get(name, value) != value:
-            raise InputError(f"{folder}: begun with {name} {recorded[name]}, here is {value}")
+    old = flattened(recorded)
+    for name, value in flattened(current).items():
+        if old.get(name, value) != value:
+            raise InputError(f"{folder}: begun with {name} {old[name]}, here is {value}")
 
 
 def by_folder(args: Tune, base: Path | None, robot: Robot) -> dict[Path, Tune]:

@@ -35,7 +35,7 @@ from hector_jax.report.run import write_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import choice, metrics, nets, tunings, verdicts
-from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, Journal, read_object
+from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, read_object
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.runs.walks import Campaign, Row, candidates, changes, tune_on_walks
@@ -91,11 +91,6 @@ class _Run(NamedTuple):
         config = self.setup.config
         loss = smoother(config.loss, self.args.smooth)
         return self.setup._replace(config=replace(config, loss=loss))
-
-    @property
-    def artefacts(self) -> Path:
-        """Folder of the artefacts."""
-        return self.folder / _ARTEFACTS
 
     @property
     def seconds(self) -> float:
@@ -155,7 +150,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         settings = _note_settings(run)
         tuned = _tune_sets(run)
         walks = _walk_sets(run, tuned.sets)
-        case = trajectories[0], run.seconds, run.artefacts / "elsewhere"
+        case = trajectories[0], run.seconds, run.folder / _ARTEFACTS / "elsewhere"
         show = small_verdict(run.setup, tuned.sets, *case) if args.verdict else None
     names = step_names(start, config.others)
     known = determined(tuned.tunings["with"].precision, config.ridge, names)
@@ -239,14 +234,14 @@ def _tune_sets(run: _Run) -> _Tuned:
     done = tunings.tune(
         run.tuning,
         run.problems,
-        run.artefacts,
+        run.folder / _ARTEFACTS,
         title=f"tuning {run.name} without and with GRFM-Net",
         start=run.start,
-        journal=Journal(run.folder / METRICS),
+        metrics=run.folder / METRICS,
     )
     results = {name: entry.tuning for name, entry in done.items()}
     setup, commands = run.setup, list(run.commands.values())
-    options = {"seconds": run.seconds, "folder": run.artefacts / "choice"}
+    options = {"seconds": run.seconds, "folder": run.folder / _ARTEFACTS / "choice"}
     choices = choice.choose(setup, results, commands, **options)
     sets = {
         "nominal": nominal(setup.robot),
@@ -292,9 +287,13 @@ def _walk_sets(
     for name, command in run.commands.items():
         suffix = f" {name}" if len(run.trajectories) > 1 else ""
         title = f"evaluating{suffix} on {plural(len(seeds), 'stand-in plant')}"
-        standin = judge(command, plants, seeds, title=title, folder=run.artefacts / "standin")
+        standin = judge(
+            command, plants, seeds, title=title, folder=run.folder / _ARTEFACTS / "standin"
+        )
         title = f"walking{suffix} on the high-fidelity simulator"
-        on_hfs = judge(command, [simulator], [0], title=title, folder=run.artefacts / "hfs")
+        on_hfs = judge(
+            command, [simulator], [0], title=title, folder=run.folder / _ARTEFACTS / "hfs"
+        )
         walks[name] = standin, on_hfs
         _say_worse(name, on_hfs)
     return walks
@@ -350,10 +349,9 @@ def _result(
 def _draw(run: _Run, tuned: _Tuned, standin: ScoredWalks, on_hfs: ScoredWalks) -> dict[str, Any]:
     """Draw the pictures and the film of a run, for its report."""
     effects = {"linear": as_effect(run.net.linear), "residual": as_effect(run.net.params)}
-    batch = jax.tree.map(lambda x: np.asarray(x)[None], on_hfs.first["nominal"])
     with ThreadPoolExecutor(1) as background:  # another process draws the film
         film = background.submit(_film, run, standin)
-        curves = fidelity.curves(run.setup.robot, batch, effects)
+        curves = fidelity.curves(run.setup.robot, on_hfs.first["nominal"], effects)
         inputs = tuned.sets, tuned.tunings, standin.first, curves, run.net.history
         drawings = pictures.of_run(run.folder, run.tuning.config, *inputs)
     return {"pictures": drawings, "film": film.result()}

@@ -1,14 +1,11 @@
 """`hector view`: show a run on a web page, or as a film and pictures."""
 
-import jax
-import numpy as np
-
 from hector_jax.cli import arguments
 from hector_jax.cli.flags import View
 from hector_jax.control.controller import walk_config
 from hector_jax.core.console import say
 from hector_jax.core.files import make_folder
-from hector_jax.core.inputs import InputError
+from hector_jax.core.inputs import InputError, require_package
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.network import as_effect, load_net
 from hector_jax.report import fidelity, pictures, view
@@ -26,7 +23,7 @@ def view_run(args: View) -> None:
     """Show a run on a page, or write its film and pictures."""
     folder = args.out or (args.run / "view" if args.headless else None)
     if folder is None:
-        view.check_viser()
+        require_package("viser", "view", "the page", " (--headless writes a film without it)")
     else:
         check_film(folder / "film.mp4")
     request = read_request(args.run)
@@ -59,8 +56,7 @@ def view_run(args: View) -> None:
             lines.append(f"{when}: {words}, L {loss:.3f}e6 in this walk")
             say(f"  {lines[-1]}")
             trajectory = at_interval(trajectory, walk_config(robot).gait.tick)
-            batch = jax.tree.map(lambda x: np.asarray(x)[None], trajectory)
-            walks[name] = view.ViewedWalk(trajectory, fidelity.curves(robot, batch, effects))
+            walks[name] = view.ViewedWalk(trajectory, fidelity.curves(robot, trajectory, effects))
         return walks, "\n\n".join(lines)
 
     def motions() -> tuple[dict[str, Motion], str]:

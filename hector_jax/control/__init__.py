@@ -17,7 +17,6 @@ from hector_jax.control.contact import (
 from hector_jax.control.controller import (
     Memory,
     Plan,
-    Retune,
     WalkConfig,
     actuate,
     init_memory,
@@ -44,7 +43,7 @@ from hector_jax.control.weights import Weights, expert, nominal
 __all__ = [
     "FootstepConfig", "GaitConfig", "LegConfig", "LINE_FOOT", "Anchor", "Command", "Contact",
     "ContactModel", "Horizon", "InputConstraint", "Measurement", "Memory", "MpcConfig",
-    "MpcProblem", "NamedCommand", "Parameters", "Plan", "Retune", "Rows", "StateConstraint", "Step",
+    "MpcProblem", "NamedCommand", "Parameters", "Plan", "Rows", "StateConstraint", "Step",
     "Tunable", "WalkConfig", "Weights", "actuate", "build_qp", "command_of", "expert",
     "init_memory", "named_command", "nominal", "plan", "reference_at", "solve_mpc",
     "standing_anchor", "step_plan", "walk_config",

@@ -5,10 +5,10 @@ worlds call `step_plan` and `actuate` with measurements. The controller knows on
 robot, never the parameters of the plant.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -120,14 +120,6 @@ class Plan(NamedTuple):
     swing_ticks: Int[Array, "*batch feet"]  # since lift-off
     residual: Float[Array, "*batch"]  # largest relative KKT residual of the QP
     status: Int[Array, "*batch"]  # of the QP, see `qp.Status`
-
-
-class Retune(NamedTuple):
-    """Weights that change during a walk: a carry, and the function for the weights of a tick."""
-
-    init: Any  # carry before t = 0
-    # carry, gait tick, anchor, measurement, wrench commanded over the previous tick
-    step: Callable[[Any, int, Anchor, Measurement, Wrench], tuple[Any, Weights]]
 
 
 def contacts_needed(config: WalkConfig, tick: int) -> int:
@@ -310,7 +302,7 @@ def actuate(
 
     Source: Eq. 5.
     """
-    target, target_rates = legs.swing_joints(
+    target = legs.swing_joints(
         robot,
         parameters,
         measurement,
@@ -320,11 +312,5 @@ def actuate(
         swing=config.gait.tick * max(config.gait.swing, 1),  # with swing 0 no foot follows its path
     )
     return legs.joint_torques(
-        robot,
-        parameters,
-        measurement,
-        contact=plan.contact,
-        wrench=plan.wrench,
-        target=target,
-        target_rates=target_rates,
+        robot, parameters, measurement, contact=plan.contact, wrench=plan.wrench, target=target
     )

@@ -130,14 +130,17 @@ def joint_torques(
     *,
     contact: Bool[Array, " feet"],
     wrench: Wrench,
-    target: Float[Array, " joints"],
-    target_rates: Float[Array, " joints"],
+    target: tuple[Float[Array, " joints"], Float[Array, " joints"]],
 ) -> Float[Array, " joints"]:
-    """Return torques [N m] within the limits: stance legs push, swing legs follow the target."""
+    """Return torques [N m] within the limits: stance legs push, swing legs follow the target.
+
+    The target is that of `swing_joints`, angles and rates.
+    """
     state, joints, joint_rates = measurement
+    angles, rates = target
     weight = leg_gravity(robot, joints, robot.gravity @ rotation_from_euler(state.euler))
     kp, kd = (jnp.tile(jnp.asarray(k), len(contact)) for k in (parameters.kp, parameters.kd))
-    swing = kp * (target - joints) + kd * (target_rates - joint_rates) + weight
+    swing = kp * (angles - joints) + kd * (rates - joint_rates) + weight
     stance = stance_torques(robot, state, joints, wrench) + parameters.gravity_compensation * weight
     torque = jnp.where(jnp.repeat(contact, robot.description.leg_joints), stance, swing)
     return jnp.clip(torque, -robot.torque_limit, robot.torque_limit)

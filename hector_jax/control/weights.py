@@ -144,9 +144,3 @@ def between(first: Weights, second: Weights, share: float = 0.5) -> Weights:
     Q, R = jax.tree.map(lambda x, y: x ** (1.0 - share) * y**share, first[:2], second[:2])
     others = jax.tree.map(lambda x, y: (1.0 - share) * x + share * y, first.others, second.others)
     return jax.tree.map(np.asarray, Weights(Q, R, others))
-
-
-def sample_weights(weights: Weights, factor: float, count: int) -> list[Weights]:
-    """Draw weight sets log-uniformly within a factor of given weights, with a fixed seed."""
-    draws = np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(direction_names(weights))))
-    return jax.device_get([scale_weights(weights, np.log(factor) * row) for row in draws])

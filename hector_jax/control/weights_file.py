@@ -1,7 +1,7 @@
 """Weights as JSON files."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,6 @@ from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import Robot
 
 WEIGHTS = Range(1e-12, 1e12)  # of weights in a file; far outside it the QP is not solved
-_MAX_BYTES = 1_000_000
 
 
 def weights_tree(weights: Weights) -> dict[str, Any]:
@@ -76,60 +75,47 @@ def load_weights(path: Path, robot: Robot | None = None) -> Weights:
         InputError: one line naming the file and the entry that is missing, unknown, of the wrong
             shape, or not a number in its range.
     """
-    path = Path(path)
-    tree = read_json(path, "weights", _MAX_BYTES, object_pairs_hook=_unique_keys)
-    others: Any = {}
-    if isinstance(tree, dict):
-        tree.pop("$schema", None)  # for editors; the content is checked here
-        others = tree.pop("others", {})
-    like = nominal(robot)
-    _check_keys(path, tree, ("Q", "R"), "")
-    if not like.R.moment.size and isinstance(tree["R"], dict):
-        tree["R"].pop("moment", None)
+    path, like = Path(path), nominal(robot)
+    tree = read_json(path, "weights", object_pairs_hook=_unique_keys)
+    # shape and range of each entry
+    parts = {
+        part: {n: (w.shape, WEIGHTS) for n, w in getattr(like, part)._asdict().items() if w.size}
+        for part in ("Q", "R")
+    }
+    others = {n: (x.shape(robot), Range(x.lower, x.upper)) for n, x in TUNABLES.items()}
+    _check_keys(path, tree, (*parts, "others", "$schema"), parts)  # a schema is for editors
     values = {}
-    for part in ("Q", "R"):
-        entries = {name: w for name, w in getattr(like, part)._asdict().items() if w.size}
-        _check_keys(path, tree[part], entries, f"{part}.")
+    for part, entries in {**parts, "others": others}.items():
+        given = tree.get(part, {})
+        if part == "R" and not like.R.moment.size and isinstance(given, dict):
+            given.pop("moment", None)
+        _check_keys(path, given, entries, parts.get(part, ()), f"{part}.")
         values[part] = {
-            name: _numbers(path, f"{part}.{name}", tree[part][name], w.shape, WEIGHTS)
-            for name, w in entries.items()
+            name: _numbers(path, f"{part}.{name}", value, *entries[name])
+            for name, value in given.items()
         }
-    Q, R = State(**values["Q"]), like.R._replace(**values["R"])
-    return Weights(Q, R, _others(path, others, robot))
-
-
-def _others(path: Path, others: Any, robot: Robot | None) -> dict[str, np.ndarray]:
-    if not isinstance(others, Mapping):
-        raise InputError(f"{path}: others must be an object, got {json.dumps(others)[:60]}")
-    values = {}
-    for name, value in others.items():
-        if name not in TUNABLES:
-            raise InputError(f"{path}: others: {unknown('tunable', name, TUNABLES)}")
-        tunable = TUNABLES[name]
-        bounds = Range(tunable.lower, tunable.upper)
-        values[name] = _numbers(path, f"others.{name}", value, tunable.shape(robot), bounds)
-    return values
+    return Weights(State(**values["Q"]), like.R._replace(**values["R"]), values["others"])
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    tree = dict(pairs)
-    if len(tree) < len(pairs):
-        keys = [key for key, _ in pairs]
-        duplicate = next(key for key in keys if keys.count(key) > 1)
-        raise ValueError(f'"{duplicate}" is given twice')
-    return tree
+    keys = [key for key, _ in pairs]
+    if duplicates := [key for key in keys if keys.count(key) > 1]:
+        raise ValueError(f'"{duplicates[0]}" is given twice')
+    return dict(pairs)
 
 
-def _check_keys(path: Path, tree: Any, names: Any, prefix: str) -> None:
-    expected = f"expected {', '.join(names)}"
+def _check_keys(
+    path: Path, tree: Any, known: Collection[str], required: Collection[str], prefix: str = ""
+) -> None:
+    expected = f"expected {', '.join(required or known)}"
     if not isinstance(tree, dict):
         where = prefix.rstrip(".") or "the file"
         raise InputError(f"{path}: {where} must be an object; {expected}")
     for key in tree:
-        if key not in names:
-            message = unknown("weight", prefix + key, [prefix + name for name in names])
+        if key not in known:
+            message = unknown("weight", prefix + key, [prefix + name for name in known])
             raise InputError(f"{path}: {message}")
-    for name in names:
+    for name in required:
         if name not in tree:
             raise InputError(f'{path}: missing weight "{prefix}{name}"; {expected}')
 

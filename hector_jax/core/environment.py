@@ -6,7 +6,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -116,13 +116,17 @@ def _syntax(source: bytes) -> tuple[str, list[str], set[str]]:
         The tree as text, the modules of this package and the other packages that it imports.
     """
     tree = ast.parse(source)
-    imported = _imported(tree)
-    packages = _packages(tree)
+    names, package = set(_imported(tree)), f"{_ROOT.name}."
+    own = [name.removeprefix(package) for name in sorted(names) if name.startswith(package)]
+    others = {name.partition(".")[0] for name in names}
+    others -= {_ROOT.name, *sys.stdlib_module_names, *_NO_NUMBER_PACKAGES}
     for node in ast.walk(tree):
         match getattr(node, "body", None):
             case [ast.Expr(ast.Constant(str())), *_] as body:
                 body.pop(0)
-    return ast.dump(tree), imported, packages
+    modules = [name for name in own if _source(name).exists()]  # other names are no modules
+    packages = {package for name in others for package in _PACKAGES_OF.get(name, (name,))}
+    return ast.dump(tree), modules, packages
 
 
 def _source(module: str) -> Path:
@@ -130,25 +134,10 @@ def _source(module: str) -> Path:
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 
-def _packages(tree: ast.Module) -> set[str]:
-    """Return the installed packages, other than this one, that a module imports."""
-    names = set()
+def _imported(tree: ast.Module) -> Iterator[str]:
+    """Yield the full names of all that a module imports, and of the modules that it is from."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            names |= {alias.name.partition(".")[0] for alias in node.names}
+            yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            names.add(str(node.module).partition(".")[0])
-    names -= {_ROOT.name, *sys.stdlib_module_names, *_NO_NUMBER_PACKAGES}
-    return {package for name in names for package in _PACKAGES_OF.get(name, (name,))}
-
-
-def _imported(tree: ast.Module) -> list[str]:
-    """Return the modules of this package that a module imports, named relative to the package."""
-    package, modules = f"{_ROOT.name}.", []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and f"{node.module}.".startswith(package):
-            module = f"{node.module}."[len(package) :]
-            names = [f"{module}{alias.name}" for alias in node.names]
-            modules += [name for name in names if _source(name).exists()]  # else not a module
-            modules += [module[:-1]] if module else []
-    return modules
+            yield from (str(node.module), *(f"{node.module}.{x.name}" for x in node.names))

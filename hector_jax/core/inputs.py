@@ -60,8 +60,10 @@ def _broken_package(error: Exception) -> str:
     suspects = [named]
     if not is_ours and any(frame.f_code.co_name == "<module>" for frame in frames):
         suspects += [last, *sorted(map(_package, sys.modules))]  # one may break another
+    # of this Python's packages: neither of PYTHONPATH nor of the script
+    folders = [x for x in sys.path[1:] if os.path.abspath(x) not in _python_path()]
     for package in suspects:
-        own, file = _file_of(package, _own_folders()), _file_of(package)
+        own, file = _file_of(package, folders), _file_of(package)
         if own and file != own and package != _package(__name__):
             folder = str(Path(file).parents[Path(file).name == "__init__.py"])
             on_path = folder in _python_path()
@@ -82,11 +84,6 @@ def _package(module: str) -> str:
 
 def _python_path() -> list[str]:
     return list(map(os.path.abspath, os.environ.get("PYTHONPATH", "").split(os.pathsep)))
-
-
-def _own_folders() -> list[str]:
-    """Return the folders of this Python's packages: neither of PYTHONPATH nor of the script."""
-    return [folder for folder in sys.path[1:] if os.path.abspath(folder) not in _python_path()]
 
 
 def _file_of(package: str, folders: list[str] | None = None) -> str:

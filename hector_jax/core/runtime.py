@@ -6,17 +6,13 @@ processes) call `setup_jax` once, before the first array.
 
 import gc
 import os
-import resource
 import signal
-import subprocess
-import sys
 import tempfile
 import threading
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from functools import cache
 from importlib import import_module
 from multiprocessing import active_children, parent_process
 from multiprocessing.context import SpawnContext, SpawnProcess
@@ -27,8 +23,6 @@ from typing import Any, cast
 
 from hector_jax.core.inputs import InputError, check_utf8, one_line, outside_packages
 from hector_jax.core.numerics import pin_options
-
-_LEAST_MEMORY = 3e9  # [B] of address space: JAX alone takes 1.3 GB, compiling a walk 2.3 GB
 
 
 def cache_folder() -> Path:
@@ -52,29 +46,20 @@ def cache_folder() -> Path:
 
 
 def start_jax(on_cpu: bool = False) -> None:
-    """Start JAX with the options of `setup_jax`, under the limits and variables of the environment.
+    """Start JAX with the options of `setup_jax` and the variables of the environment.
 
     Args:
         on_cpu: compute on the CPU even if there are accelerators.
 
     Raises:
-        InputError: one line with the limit or variable that prevents it.
+        InputError: one line with the variables that prevent it.
     """
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if limit != resource.RLIM_INFINITY and limit < _LEAST_MEMORY:  # JAX would hang or abort
-        raise InputError(
-            f"the limit on virtual memory (ulimit -v) is {limit / 1e9:.1f} GB, expected at least "
-            f"{_LEAST_MEMORY / 1e9:g} GB"
-        )
-    flags = os.environ.get("XLA_FLAGS", "")
     variables = [f"{name}={os.environ[name]}" for name in sorted(os.environ) if name[:4] == "JAX_"]
     try:
         with outside_packages():
             import_module("numpy.linalg")  # first: where it is broken, jaxlib prints a traceback
             import jax
 
-            if flags and (fault := _fault_of_xla(flags)):
-                raise InputError(f"XLA_FLAGS={flags}: {fault}")
             if on_cpu:
                 jax.config.update("jax_platforms", "cpu")
             setup_jax()  # before the devices start, which read some options once
@@ -84,28 +69,6 @@ def start_jax(on_cpu: bool = False) -> None:
     except Exception as error:  # of several types, some without a message
         what = f"JAX does not start{' with ' if variables else ''}{', '.join(variables)}"
         raise InputError(f"{what}: {one_line(error) or 'no such device here'}") from None
-    not_finite = jax.numpy.array([jax.numpy.nan, jax.numpy.inf])
-    see = jax.jit(lambda x: jax.numpy.isnan(x) | jax.numpy.isinf(x))
-    if flags and not see(not_finite).all():  # as with some flags of fast mathematics
-        raise InputError(f"XLA_FLAGS={flags}: programs would not see NaN and infinity")
-
-
-@cache
-def _fault_of_xla(flags: str) -> str:
-    """Return why XLA does not start with these XLA_FLAGS, or "".
-
-    An unknown flag ends a process, so they are tried in a process of their own.
-    """
-    done = subprocess.run(
-        [sys.executable, "-c", "from jaxlib.xla_client import make_cpu_client as c; c()"],
-        env=os.environ | {"XLA_FLAGS": flags},
-        capture_output=True,
-        text=True,
-        errors="replace",
-    )
-    if not done.returncode:
-        return ""
-    return one_line(done.stderr.strip().rpartition("\n")[2].rpartition("] ")[2])
 
 
 def setup_jax() -> None:
@@ -126,25 +89,6 @@ def setup_jax() -> None:
     # Tracing creates millions of long-lived objects: collecting garbage takes a fifth of its time.
     gc.freeze()
     gc.set_threshold(100_000, 20, 100)
-
-
-def all_devices() -> None:
-    """Make every CPU core a JAX device, and join the hosts of a cluster.
-
-    Call after `setup_jax` and before the first array. Hosts are joined if the environment names a
-    coordinator (`JAX_COORDINATOR_ADDRESS`, with `JAX_NUM_PROCESSES` and `JAX_PROCESS_ID` unless JAX
-    detects the cluster) or inside a job step of Slurm or Open MPI.
-    """
-    import jax
-
-    if "host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
-        cores = getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count() or 1))(0)
-        jax.config.update("jax_num_cpu_devices", len(cores))
-    clusters = ("JAX_COORDINATOR_ADDRESS", "SLURM_STEP_NODELIST", "OMPI_MCA_orte_hnp_uri")
-    if any(name in os.environ for name in clusters):
-        variables = ("JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
-        count, rank = (int(os.environ[v]) if v in os.environ else None for v in variables)
-        jax.distributed.initialize(num_processes=count, process_id=rank)
 
 
 class _Process(SpawnProcess):

@@ -132,15 +132,6 @@ def _expected(kind: Any, rule: Rule | None = None) -> str:
     return words.get(kind) or f"a {kind.__name__}"
 
 
-def validation_error(value: Any, kind: Any, rule: Rule | None = None) -> str | None:
-    """Return the error message of a value, `must be ..., got ...`; None if it is valid."""
-    try:
-        convert(value, kind, rule)
-    except InputError as error:
-        return str(error)
-    return None
-
-
 def check(settings: Any, /, **rules: Rule) -> None:
     """Check the fields of a dataclass against their types and ranges; for `__post_init__`.
 
@@ -172,7 +163,7 @@ def read_json(path: Path, what: str, max_bytes: int = 10_000_000, **options: Any
     return _decoded(path, "JSON", lambda: json.loads(read_text(path, what, max_bytes), **options))
 
 
-def read_toml(path: Path, what: str, max_bytes: int) -> dict[str, Any]:
+def read_toml(path: Path, what: str, max_bytes: int = 10_000_000) -> dict[str, Any]:
     """Read a TOML file with `inputs.read_text`.
 
     Raises:
@@ -186,13 +177,8 @@ def _decoded(path: Path, language: str, decode: Callable[[], Any]) -> Any:
         return decode()
     except InputError:
         raise
-    except RecursionError:
-        reason = "nested too deeply"
-    except ValueError as error:
-        reason = one_line(error)
-        if "set_int_max_str_digits" in reason:  # advice for programmers, not for users
-            reason = "a number has too many digits"
-    raise InputError(f"{path}: not valid {language}: {reason}")
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not valid {language}: {one_line(error)}") from None
 
 
 def from_table(where: str, kind: type[T], table: Any) -> T:

@@ -68,7 +68,7 @@ def collect(
     Raises:
         InputError: a walk in the folder is of another job, robot or of other settings; or the
             folder cannot be written.
-        ValueError: walks are missing or too short.
+        ValueError: walks are missing, or too short.
     """
     interval = walk_config(robot).gait.tick
     # a JSON round trip, to compare equal with settings that are read from a file
@@ -85,13 +85,11 @@ def collect(
     done = len(jobs) - len(missing)
     progress(done, len(jobs))
     new_walks = walk_jobs([jobs[i] for i in missing]) if missing else ()
-    for i, walk in zip(missing, new_walks, strict=False):
+    for i, walk in zip(missing, new_walks, strict=True):
         walks[i] = Walks(stack([jobs[i]]), stack([at_interval(walk, interval)]))
         save_tree(paths[i], walks[i], kind="walks", robot=robot, about=facts)
         done += 1
         progress(done, len(jobs))
-    if done < len(jobs):
-        raise ValueError(f"{folder}: {len(jobs)} walks asked for, {done} came")
     falls = sum(bool(np.any(walk.trajectory.fallen)) for walk in walks if walk is not None)
     write_json(Path(folder) / "card.json", {"walks": len(jobs), "falls": falls, **facts})
 
@@ -107,7 +105,8 @@ def load_walks(folder: Path, robot: Robot) -> Walks:
         InputError: one line naming folder or file: nothing collected, not finished, damaged, or of
             another robot.
     """
-    parts = [_load_file(path, robot) for path in _read_collection(folder)[0]]
+    like, paths = walks_like(robot), _read_collection(folder)[0]
+    parts = [load_tree(path, like, kind="walks", robot=robot)[0] for path in paths]
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
@@ -140,18 +139,6 @@ def _read_collection(folder: Path) -> tuple[list[Path], dict[str, Any]]:
     return paths, settings
 
 
-def _load_file(path: Path, robot: Robot) -> Walks:
-    walks = load_tree(path, walks_like(robot), kind="walks", robot=robot)[0]
-    count, ticks = walks.trajectory.fallen.shape
-    for name, tree in (("job", walks.job), ("trajectory", walks.trajectory)):
-        if any(len(leaf) != count for leaf in jax.tree.leaves(tree)):
-            raise InputError(f"{path}: {name} is not of {count} walks, as trajectory.fallen is")
-    by_tick = walks.trajectory._replace(initial=None, period=None)
-    if not count or any(leaf.shape[1] != ticks for leaf in jax.tree.leaves(by_tick)):
-        raise InputError(f"{path}: its walks are not of one length, that of trajectory.fallen")
-    return walks
-
-
 def _load_if_sound(path: Path, job: Job, robot: Robot, settings: dict[str, Any]) -> Walks | None:
     if not path.exists():
         return None
@@ -161,7 +148,7 @@ def _load_if_sound(path: Path, job: Job, robot: Robot, settings: dict[str, Any])
         say(f"made anew: {error}")
         return None
     check_settings(path, card["about"].get("settings", {}), settings)
-    walks = _load_file(path, robot)
+    walks, _ = load_tree(path, walks_like(robot), kind="walks", robot=robot)
     if not all(jax.tree.leaves(jax.tree.map(np.array_equal, walks.job, job))):
         raise InputError(f"{path}: collected for other walks; choose another folder or seed")
     return walks

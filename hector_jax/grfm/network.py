@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hector_jax.control.controller import WalkConfig, walk_config
-from hector_jax.core.inputs import InputError, short_repr
-from hector_jax.core.settings import Range, validation_error
+from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import load_tree, read_card, save_tree
 from hector_jax.grfm.effect import Phi
 from hector_jax.grfm.gated import GATED
@@ -26,7 +25,6 @@ VARIANTS = {phi.name: phi for phi in (RESIDUAL, PAPER, GATED, LINEAR)}
 """Every variant by its name; whoever adds one adds it here."""
 
 Params = Any  # of a variant: `Phi.params`
-_MAX_LAYERS, _MAX_WIDTH = 8, 4096  # hidden layers and their units in a file
 
 
 def variant_of(params: Params) -> Phi:
@@ -60,27 +58,6 @@ def save_net(path: Path, params: Params, *, robot: Robot, about: dict[str, Any])
     save_tree(path, params, kind=f"grfm-{phi.name}", robot=robot, about={**facts, **about})
 
 
-def read_net_card(path: Path, variant: str | None = None) -> tuple[str, dict[str, Any]]:
-    """Read variant and card of the GRFM-Net in a file; see `load_net`.
-
-    Raises:
-        InputError: one line naming the file: damaged, no net, or a net of another variant.
-    """
-    card = read_card(path)
-    kinds = {f"grfm-{name}": name for name in ([variant] if variant else VARIANTS)}
-    if card["kind"] not in kinds:
-        kind = short_repr(card["kind"])[1:-1]
-        raise InputError(f"{path}: holds {kind}, expected {' or '.join(kinds)}")
-    hidden = card["about"].get("hidden")
-    sizes = hidden if isinstance(hidden, list) and len(hidden) <= _MAX_LAYERS else [None]
-    if any(validation_error(size, int, Range(1, _MAX_WIDTH)) for size in sizes):
-        raise InputError(
-            f"{path}: about.hidden must be at most {_MAX_LAYERS} whole numbers from 1 to "
-            f"{_MAX_WIDTH}, got {short_repr(hidden)}"
-        )
-    return kinds[card["kind"]], card
-
-
 def load_net(
     path: Path, robot: Robot, variant: str | None = None
 ) -> tuple[Params, str, dict[str, Any]]:
@@ -95,9 +72,12 @@ def load_net(
         InputError: one line naming the file: damaged, of another robot, kind, layout or variant, or
             with a number that is not finite.
     """
-    name, card = read_net_card(path, variant)
+    kinds, card = {f"grfm-{x}": x for x in ([variant] if variant else VARIANTS)}, read_card(path)
+    if (kind := card["kind"]) not in kinds:
+        raise InputError(f"{path}: holds {kind}, expected {' or '.join(kinds)}")
+    name = kinds[kind]
     like = layout(name, tuple(card["about"]["hidden"]), walk_config(robot))
-    params, card = load_tree(path, like, kind=card["kind"], robot=robot)
+    params, card = load_tree(path, like, kind=kind, robot=robot)
     if not all(np.isfinite(p).all() for p in jax.tree.leaves(params)):
         raise InputError(f"{path}: a parameter of the net is not finite")
     return params, name, card

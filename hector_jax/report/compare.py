@@ -13,7 +13,7 @@ from rich.text import Text
 
 from hector_jax.core.inputs import InputError
 from hector_jax.report.report import VOID, plain_console
-from hector_jax.runs.folder import RESULT, Run
+from hector_jax.runs.folder import RESULT, Histories, Run
 from hector_jax.runs.metrics import BASELINES, Interval
 
 
@@ -35,7 +35,7 @@ def compare_runs(runs: Sequence[Run]) -> dict[str, Any]:
             "run": run.name,
             "seconds": float(run.made_with["seconds"]) if "seconds" in run.made_with else None,
             "sets": {name: _verdict(run, name) for name in run.result["sets"]},
-            "tuning": _iterations(run.metrics),
+            "tuning": _iterations(run.histories),
             "versions": dict(run.made_with),
         }
         for run in runs
@@ -60,13 +60,11 @@ def _verdict(run: Run, name: str) -> dict[str, Any]:
         ) from None
 
 
-def _iterations(metrics: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
-    counts: dict[str, dict[str, int]] = {}
-    for line in metrics:
-        count = counts.setdefault(line["set"], {"iterations": -1, "refused": 0})
-        count["iterations"] += 1  # the start is not an iteration
-        count["refused"] += not line["accepted"]
-    return counts
+def _iterations(histories: Histories) -> dict[str, dict[str, int]]:
+    return {  # the start is not an iteration
+        name: {"iterations": len(rows) - 1, "refused": sum(not i.accepted for i in rows)}
+        for name, rows in histories.items()
+    }
 
 
 def _differing(tables: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:

@@ -151,17 +151,6 @@ def drift(
     return Drift(config.tick * np.arange(1, ticks + 1), rms("position"), rms("euler"))
 
 
-def drifts(
-    robot: Robot,
-    effects: Mapping[str, jax.tree_util.Partial],
-    walks: Trajectory,
-    start_tick: Int[np.ndarray, " W"],
-) -> dict[str, Drift]:
-    """Compute `drift` for several phi and for the measured wrench."""
-    phis = {**effects, "measured": None}
-    return {name: drift(robot, effect, walks, start_tick) for name, effect in phis.items()}
-
-
 def as_result(
     errors: Mapping[str, Mapping[str, Any]], phases: Mapping[str, Any], drifts: Mapping[str, Drift]
 ) -> dict[str, Any]:
@@ -179,22 +168,21 @@ def as_result(
 
 
 def curves(
-    robot: Robot, walks: Trajectory, effects: Mapping[str, jax.tree_util.Partial]
+    robot: Robot, walk: Trajectory, effects: Mapping[str, jax.tree_util.Partial]
 ) -> dict[str, Wrench]:
-    """Return commanded, predicted and measured wrenches of the first walk, for a picture.
+    """Return commanded, predicted and measured wrenches of a walk, for a picture.
 
     Point feet have no moments in any of them.
 
     Args:
         robot: the body that walked.
-        walks: as for `make_dataset`.
+        walk: at the plan interval.
         effects: phis by name; `linear`, `paper` and `residual` are used, the last as `predicted`.
 
     Returns:
         Wrenches (ticks, feet, 3) in the yaw frame, from t = 0; NaN at ticks without a sample.
     """
-    first = jax.tree.map(lambda x: np.asarray(x)[:1], walks)
-    samples, _ = make_dataset(robot, first)
+    samples, _ = make_dataset(robot, jax.tree.map(lambda x: np.asarray(x)[None], walk))
     window = jax.tree.map(jnp.asarray, samples.window)
     wrenches = {
         "commanded": jax.tree.map(lambda w: w[:, 0], samples.window.commands),
@@ -206,7 +194,7 @@ def curves(
 
     def by_tick(values: Any) -> np.ndarray:
         """Place values by tick; NaN at the first ticks, unsolved ones and those after a fall."""
-        rows = np.full((first.fallen.shape[1], *values.shape[1:]), np.nan)
+        rows = np.full((len(walk.fallen), *values.shape[1:]), np.nan)
         rows[samples.tick] = values
         return rows
 

@@ -1,6 +1,7 @@
 """The report of a verdict in several engines and models: a page, its numbers and a picture."""
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,30 +43,21 @@ def share_text(share: Interval) -> str:
     return f"{value} [{low}, {high}] %"
 
 
-def claims(cells: Cells, differs: Mapping[str, str], family: str) -> list[str]:
-    """List the claims that the walks support; arguments as in `limits`."""
-    return _lines("claims.txt.j2", cells, differs, family)
-
-
-def limits(cells: Cells, differs: Mapping[str, str], family: str) -> list[str]:
-    """List the limits of the claims.
+def claims(cells: Cells, differs: Mapping[str, str], family: str) -> dict[str, list[str]]:
+    """List the `claims` that the walks support, and their `limits`.
 
     Args:
         cells: the walks.
         differs: differences of the plants in an engine from those in MuJoCo C, by its name.
         family: family of the plants.
     """
-    return _lines("limits.txt.j2", cells, differs, family)
-
-
-def _lines(template: str, cells: Cells, differs: Mapping[str, str], family: str) -> Any:
     names = matrix.sets_of(cells)
     pairs = [(n, b) for n in names for b in BASELINES if b in names and b != n]
     pairs = [(n, b) for n, b in pairs if n not in BASELINES] or pairs[-1:]
     seeds = {column: verdict.seeds for (column, _), verdict in cells.items()}
     changes = {pair: matrix.changes(cells, *pair) for pair in pairs}
-    text = render(
-        template,
+    fill = partial(
+        render,
         matrix=matrix,
         cells=cells,
         above={
@@ -75,7 +67,7 @@ def _lines(template: str, cells: Cells, differs: Mapping[str, str], family: str)
         void={pair: [x for x, c in row.items() if not c.counts] for pair, row in changes.items()},
         names=names,
         pairs=pairs,
-        seeds=map(seeds_text, seeds.values()),
+        seeds=list(map(seeds_text, seeds.values())),
         engines=list(dict.fromkeys(column.engine for column in seeds)),
         models=list(dict.fromkeys(column.model for column in seeds)),
         coarse=[c for c, drawn in seeds.items() if FEWEST <= len(drawn) < _COARSE],
@@ -89,7 +81,8 @@ def _lines(template: str, cells: Cells, differs: Mapping[str, str], family: str)
         LEARNED_FROM=LEARNED_FROM,
         tuned=[name for name in names if name not in BASELINES],
     )
-    return [line for line in text.splitlines() if line]
+    texts = {name: fill(f"{name}.txt.j2") for name in ("claims", "limits")}
+    return {name: [x for x in text.splitlines() if x] for name, text in texts.items()}
 
 
 def tables(cells: Cells) -> dict[str, str]:
@@ -123,7 +116,7 @@ def print_verdict(cells: Cells, differs: Mapping[str, str], family: str) -> None
             text = change_text(compare(verdict, name, baseline), void=" *")
             texts.append(f"{name} {text}" + f" ({plural(falls, 'fall')})" * bool(falls))
         print(f"{cell_text(cell):32s} {'   '.join(texts)}")
-    for line in claims(cells, differs, family):
+    for line in claims(cells, differs, family)["claims"]:
         print(line)
 
 
@@ -149,8 +142,7 @@ def write_report(
         command: command line that repeats the verdict.
     """
     contents = {
-        "claims": claims(cells, differs, family),
-        "limits": limits(cells, differs, family),
+        **claims(cells, differs, family),
         "config": dict(config),
         "environment": dict(environment),
     }

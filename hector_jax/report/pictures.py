@@ -75,7 +75,7 @@ def of_nets(
         folder: output folder.
         tick: interval between plans [s].
         ground: result of `fidelity.curves` for the first held-out walk.
-        drifts: results of `fidelity.drifts` by world.
+        drifts: results of `fidelity.drift` by world and phi.
         trainings: errors by epoch, by the name of the picture.
 
     Returns:

@@ -77,14 +77,10 @@ def check_film(path: Path) -> None:
     Raises:
         InputError: the ending is none of `ENDINGS`, or MUJOCO_GL names no back end.
     """
-    _check_ending(path)
-    if back_end := os.environ.get("MUJOCO_GL"):
-        choose("MUJOCO_GL", back_end.lower(), (*BACK_ENDS, "disable"))
-
-
-def _check_ending(path: Path) -> None:
     if path.suffix.lower() not in ENDINGS:
         raise InputError(f"a film must end in {', '.join(ENDINGS)}, got {path.name}")
+    if back_end := os.environ.get("MUJOCO_GL"):
+        choose("MUJOCO_GL", back_end.lower(), (*BACK_ENDS, "disable"))
 
 
 def write_film(
@@ -93,7 +89,7 @@ def write_film(
     """Draw two walks side by side, and below them their distance from the reference.
 
     Args:
-        path: film (.mp4), or animated picture that repeats (.webp, .gif, .png).
+        path: film (.mp4), or animated picture that repeats (.webp, .gif, .png); see `check_film`.
         robot: the body that walked.
         motions: two of one command by set or title, before and after.
         config: size and rate.
@@ -103,9 +99,7 @@ def write_film(
 
     Raises:
         VideoUnavailable: no back end works on this machine, or there is no encoder.
-        InputError: the path has another ending.
     """
-    _check_ending(path)
     if path.suffix.lower() == ".mp4":
         try:
             imageio_ffmpeg.get_ffmpeg_exe()

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import InputError, require_package
+from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.report.motion import COLOURS, INK, Motion
 from hector_jax.report.report import render
@@ -83,15 +83,6 @@ def arrows(motion: Motion, kind: str, source: str) -> Float[np.ndarray, "T feet 
     return np.stack([start, start + scale * getattr(motion.wrenches[source], kind)], axis=2)
 
 
-def check_viser() -> None:
-    """Check, before any walk, that the page can be drawn.
-
-    Raises:
-        InputError: viser is not installed.
-    """
-    require_package("viser", "view", "the page", " (--headless writes a film without it)")
-
-
 def serve(
     walk: Callable[[], tuple[Mapping[str, Motion], str]],
     model: mujoco.MjModel,
@@ -113,9 +104,8 @@ def serve(
         port: port to listen on; if it is in use, a free one.
 
     Raises:
-        InputError: viser is not installed, or the server cannot listen on the address.
+        InputError: the server cannot listen on the address.
     """
-    check_viser()
     import viser
 
     # a browser that disconnects early would print a traceback

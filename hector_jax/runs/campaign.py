@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -95,22 +94,20 @@ def with_leg_numbers(walk: WalkConfig, start: Weights, names: Sequence[str]) -> 
 
 
 def box_of(campaign: Campaign) -> Float[np.ndarray, "n 2"]:
-    """Return bounds of the steps: of log-weights, and of other numbers in units of `_unit`."""
+    """Return bounds of the steps: of log-weights, and of other numbers in their units."""
     return checked_bounds(campaign.start, campaign.numbers) / _units(campaign)[:, None]
 
 
-def _unit(campaign: Campaign, name: str) -> Any:
-    """Return the unit steps of a number: a tenth of its range, of joint gains half of the start."""
-    tunable = parameters.TUNABLES[name]
-    return 0.5 * campaign.start.others[name] if tunable.each_joint else 0.1 * tunable.width
-
-
 def _units(campaign: Campaign) -> Float[np.ndarray, " n"]:
-    """Return the units of all steps, in those of `parameters.stepped`."""
+    """Return the units of all steps, in those of `parameters.stepped`.
+
+    That of a number is a tenth of its range, of joint gains half of the start.
+    """
     units = [np.ones(len(direction_names(campaign.start)))]
     for name in campaign.numbers:
-        unit = _unit(campaign, name) / parameters.TUNABLES[name].width
-        units.append(np.broadcast_to(unit, np.shape(campaign.start.others[name])).ravel())
+        tunable, start = parameters.TUNABLES[name], campaign.start.others[name]
+        unit = (0.5 * start if tunable.each_joint else 0.1 * tunable.width) / tunable.width
+        units.append(np.broadcast_to(unit, np.shape(start)).ravel())
     return np.concatenate(units)
 
 

@@ -6,8 +6,7 @@ of code and packages, `metrics.jsonl` a line for each iteration, `weights/` the 
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,10 +38,8 @@ from hector_jax.tuning.status import status_of
 
 CONFIG, METRICS, RESULT, VERSIONS = "config.json", "metrics.jsonl", "result.json", "versions.json"
 _MAX_BYTES = 100_000_000
-# types of entries of a line of metrics.jsonl
-_TYPES = {"set": str, "iteration": int, "accepted": bool, "weights": dict, "gradient_log": dict}
 
-Histories = dict[str, list[Iteration]]  # by set
+Histories = Mapping[str, Sequence[Iteration]]  # by set
 
 
 class Run(NamedTuple):
@@ -50,7 +47,7 @@ class Run(NamedTuple):
 
     name: str  # the folder as the user named it
     result: Mapping[str, Any]  # result.json
-    metrics: list[dict[str, Any]]  # metrics.jsonl
+    histories: Histories  # metrics.jsonl
     settings: dict[str, Any]  # config.json, nested names joined by dots
     made_with: Mapping[str, str]  # versions.json
 
@@ -77,7 +74,7 @@ def load_run(folder: Path) -> Run:
     result, config, made_with = (read_object(folder / name) for name in (RESULT, CONFIG, VERSIONS))
     if not isinstance(result.get("sets"), dict):
         raise InputError(f"{folder / RESULT}: no `sets` in it; expected the result of a tuning")
-    return Run(str(folder), result, read_metrics(folder), _flat(config), made_with)
+    return Run(str(folder), result, read_histories(folder), flattened(config), made_with)
 
 
 def read_request(folder: Path) -> RunRequest:
@@ -133,74 +130,46 @@ def as_line(name: str, iteration: Iteration) -> str:
     return as_json(plain) + "\n"
 
 
-class Journal:
-    """Writer of metrics.jsonl: a line per iteration, in order of arrival, sorted at the end."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._histories: dict[str, Sequence[Iteration]] = {}
-
-    def write(self, histories: Mapping[str, Sequence[Iteration]]) -> None:
-        """Rewrite the file, adding these tunings to the earlier ones or replacing them by name.
-
-        Raises:
-            WriteError: the file cannot be written; the old file stays.
-        """
-        self._histories.update(histories)
-        lines = (as_line(name, i) for name, history in self._histories.items() for i in history)
-        write_file(self.path, "".join(lines).encode())
-
-    def add(self, name: str, iteration: Iteration) -> None:
-        """Append a line.
-
-        Raises:
-            WriteError: the file cannot be written.
-        """
-        append_file(self.path, as_line(name, iteration).encode())
-
-
-def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """Read the lines of metrics.jsonl of a run; an incomplete last line is skipped.
+def write_histories(path: Path, histories: Histories) -> None:
+    """Write metrics.jsonl anew, tuning by tuning; while they run, `add_iteration` appends to it.
 
     Raises:
-        InputError: one line naming the file and the damaged line, if any.
+        WriteError: the file cannot be written; the old file stays.
     """
-    path = folder / METRICS
-    text = read_text(path, "the iterations of a run of `hector tune`", _MAX_BYTES)
-    rows = []
-    for number, line in enumerate(text.rpartition("\n")[0].splitlines(), 1):
-        with _line(path, number):
-            row = json.loads(line)
-            for name, expected in _TYPES.items():
-                if not isinstance(row[name], expected):
-                    raise TypeError(f"{name}: {row[name]!r}")
-            rows.append(row)
-    return rows
+    lines = (as_line(name, i) for name, history in histories.items() for i in history)
+    write_file(path, "".join(lines).encode())
 
 
-def read_histories(folder: Path) -> Histories:
+def add_iteration(path: Path, name: str, iteration: Iteration) -> None:
+    """Append a line to metrics.jsonl.
+
+    Raises:
+        WriteError: the file cannot be written.
+    """
+    append_file(path, as_line(name, iteration).encode())
+
+
+def read_histories(folder: Path) -> dict[str, list[Iteration]]:
     """Read the iterations of a run so far, by set; empty if nothing was written yet.
+
+    An incomplete last line is skipped.
 
     Raises:
         InputError: one line naming the file and the line that is not an iteration.
     """
-    path = folder / METRICS
-    histories: Histories = {}
-    for number, row in enumerate(read_metrics(folder) if path.exists() else [], 1):
-        with _line(path, number):
+    path, histories = folder / METRICS, {}
+    if not path.exists():
+        return histories
+    text = read_text(path, "the iterations of a run of `hector tune`", _MAX_BYTES)
+    for number, line in enumerate(text.rpartition("\n")[0].splitlines(), 1):
+        try:
+            row = json.loads(line)
             histories.setdefault(row["set"], []).append(_iteration(row))
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise InputError(
+                f"{path}, line {number}: an iteration of a tuning was expected ({error!r})"
+            ) from None
     return histories
-
-
-@contextmanager
-def _line(path: Path, number: int) -> Iterator[None]:
-    """Report errors in the block as errors of this line."""
-    try:
-        yield
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"{path}, line {number}: an iteration of a tuning was expected ({error!r})"
-        ) from None
 
 
 def _iteration(row: Mapping[str, Any]) -> Iteration:
@@ -247,12 +216,12 @@ def read_object(path: Path) -> dict[str, Any]:
     return value
 
 
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return a nested dictionary as a flat dictionary whose names are joined by dots."""
     flat = {}
     for key, value in tree.items():
         name = prefix + key
-        flat |= _flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
+        flat |= flattened(value, f"{name}.") if isinstance(value, dict) else {name: value}
     return flat
 
 
@@ -280,13 +249,13 @@ def weights_of(folder: Path, name: str, robot: Robot | None = None) -> tuple[Wei
     raise InputError(f"{folder} has no weight set {name!r}; it has {', '.join(names)}")
 
 
-def _newest(histories: Mapping[str, Sequence[Iteration]]) -> dict[str, Iteration]:
+def _newest(histories: Histories) -> dict[str, Iteration]:
     """Return the last accepted iteration of each set that has accepted iterations."""
     accepted = {name: [i for i in history if i.accepted] for name, history in histories.items()}
     return {name: history[-1] for name, history in accepted.items() if history}
 
 
-def loss_curves(histories: Mapping[str, Sequence[Iteration]]) -> dict[str, Float[np.ndarray, " n"]]:
+def loss_curves(histories: Histories) -> dict[str, Float[np.ndarray, " n"]]:
     """Return L in 1e6 by iteration, NaN if rejected and as padding to the longest history."""
     count, curves = max(map(len, histories.values()), default=0), {}
     for name, history in histories.items():
@@ -295,7 +264,7 @@ def loss_curves(histories: Mapping[str, Sequence[Iteration]]) -> dict[str, Float
     return curves
 
 
-def progress_sentence(histories: Mapping[str, Sequence[Iteration]], done: bool) -> str:
+def progress_sentence(histories: Histories, done: bool) -> str:
     """Describe the progress of the tunings."""
     newest = [
         f"{name}: iteration {last.iteration}, L {last.evaluation.loss / 1e6:.3f}e6"

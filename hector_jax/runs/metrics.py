@@ -155,11 +155,8 @@ def make_verdict(
     stacked = {}
     for name in next(iter(scores.values())):
         by_scene = [sets[name] for sets in scores.values()]
-        for scene, walks in zip(scores, by_scene, strict=True):
-            if len(walks) != len(seeds):
-                text = f"set '{name}' has {len(walks)} walks on {scene} for {len(seeds)} seeds"
-                raise ValueError(text)
-        stacked[name] = stack([stack(walks) for walks in zip(*by_scene, strict=True)])
+        by_plant = zip(seeds, *by_scene, strict=True)
+        stacked[name] = stack([stack(walks) for _, *walks in by_plant])
         if wrong := np.asarray(seeds)[~np.isfinite(stacked[name].L).all(axis=1)].tolist():
             raise ValueError(f"set '{name}': the loss on seeds {wrong} is not a finite number")
     return Verdict(np.asarray(seeds, int), tuple(scores), stacked, loss)

@@ -25,7 +25,7 @@ from hector_jax.core.tree import stack
 from hector_jax.grfm import network
 from hector_jax.robot.model import Robot
 from hector_jax.runs.cache import content_key, load_or_make
-from hector_jax.runs.folder import Journal
+from hector_jax.runs.folder import add_iteration, write_histories
 from hector_jax.runs.setup import Setup
 from hector_jax.sim.diagnosis import not_the_weights
 from hector_jax.sim.loop import Job
@@ -165,7 +165,7 @@ def tune(
     *,
     title: str,
     start: Weights | None = None,
-    journal: Journal | None = None,
+    metrics: Path | None = None,
 ) -> dict[str, Tuned]:
     """Tune several problems in parallel; finished tunings are saved in `folder`.
 
@@ -178,7 +178,7 @@ def tune(
         folder: folder of the tunings, a file for each; tunings in it are not repeated.
         start: weights at the start; the nominal weights by default.
         title: title of the progress bar.
-        journal: journal of the iterations.
+        metrics: file of the iterations, see `folder.as_line`.
 
     Raises:
         InputError: with the weights at the start the model falls or a QP is not solved; or the
@@ -186,30 +186,25 @@ def tune(
     """
     start = nominal(setup.robot) if start is None else start
     key = partial(content_key, setup.config, setup.robot, start, code=TUNING_CODE)
-    paths = {
-        name: folder / f"tuning-{name}-{key(commands, net, _phi_of(net))}.npz"
-        for name, (commands, net) in problems.items()
-    }
+    paths = {}
+    for name, (commands, net) in problems.items():
+        phi = "" if net is None else function_id(network.variant_of(net).apply)
+        paths[name] = folder / f"tuning-{name}-{key(commands, net, phi)}.npz"
 
     def on_iteration(name: str, iteration: Iteration) -> None:
-        if journal is not None:
-            journal.add(name, iteration)
+        if metrics is not None:
+            add_iteration(metrics, name, iteration)
 
     def make(missing: list[str], stored: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuned]]:
-        if journal is not None:  # in the order of the problems
-            journal.write({n: stored[n].tuning.iterations if n in stored else () for n in problems})
+        if metrics is not None:
+            write_histories(metrics, {n: tuned.tuning.iterations for n, tuned in stored.items()})
         remaining = {name: problems[name] for name in missing}
         return _tunings(setup, start, remaining, title, on_iteration)
 
     tuned = load_or_make(paths, make, **artefact(setup, start))
-    if journal is not None:
-        journal.write({name: result.tuning.iterations for name, result in tuned.items()})
+    if metrics is not None:
+        write_histories(metrics, {n: result.tuning.iterations for n, result in tuned.items()})
     return tuned
-
-
-def _phi_of(net: network.Params | None) -> str:
-    """Return what identifies the functions of a net in the key of a tuning."""
-    return "" if net is None else function_id(network.variant_of(net).apply)
 
 
 def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:

@@ -195,6 +195,6 @@ def judge(
     results = score_jobs(setup, jobs, title=title, folder=folder, engine=engine, with_walk=first)
     by_set = {name: [results[name, seed][0] for seed in seeds] for name in sets}
     say_faults(by_set)
-    firsts = {name: results[name, seeds[0]][1] for name in sets}
-    walks = {name: walk for name, walk in firsts.items() if walk is not None}
+    firsts = ((name, results[name, seeds[0]][1]) for name in sets)
+    walks = {name: walk for name, walk in firsts if walk is not None}
     return ScoredWalks(by_set, walks)

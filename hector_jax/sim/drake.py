@@ -25,9 +25,9 @@ from hector_jax.robot.model import Robot
 from hector_jax.sim import bodies
 from hector_jax.sim.bodies import Body
 from hector_jax.sim.loop import Job
-from hector_jax.sim.plant import LEGS, OTHER, Plant, PointContacts, lasting_world
+from hector_jax.sim.plant import LEGS, OTHER, Plant, PointContacts
 from hector_jax.sim.sensing import Ground
-from hector_jax.sim.world import World, standing_qpos
+from hector_jax.sim.world import World, build_world, standing_qpos
 
 _SMALL_MASS = 1e-6  # [kg] of the body between a motor's hinge and a gear's
 _SHAPES = {
@@ -41,11 +41,11 @@ logging.getLogger("drake").addFilter(lambda record: "deformable" not in record.g
 
 
 class DrakePlant(Plant):
-    """A `Plant` in Drake; its world is the same from the walk's start to its end."""
+    """A `Plant` in Drake."""
 
     def __init__(self, job: Job, body: Robot, first: int, end: int) -> None:
         """Build as a `BuildPlant` does."""
-        world = lasting_world("drake", job, body, first, end)
+        world = build_world(job.imperfections, body.description)
         builder = DiagramBuilder()
         plant, scene = multibody.AddMultibodyPlantSceneGraph(builder, TIME_STEP)
         plant.set_discrete_contact_approximation(multibody.DiscreteContactApproximation.kLagged)

@@ -42,7 +42,7 @@ class Engine(NamedTuple):
     name: str  # in flags, logs and cards
     title: str  # in reports
     walk: Callable[..., Iterator[Trajectory]]
-    bits: Callable[[bool], int]  # of the physics, by `exact`
+    bits: Callable[[bool], int] = lambda exact: 64  # of the physics
     modules: tuple[str, ...] = ("sim.walk",)  # modules of this package that decide its numbers
     package: str = "mujoco"  # its Python package; the extra with the engine's name installs it
     # differences of its plants from MuJoCo C, for reports; empty means the same physics, and a walk
@@ -63,11 +63,7 @@ class Engine(NamedTuple):
             return None
 
 
-def _double(exact: bool) -> int:
-    return 64
-
-
-MUJOCO_C = Engine("c", "MuJoCo C", walk_many, _double)
+MUJOCO_C = Engine("c", "MuJoCo C", walk_many)
 """MuJoCo C, one walk per process."""
 
 
@@ -79,7 +75,8 @@ def _import_and_build(name: str, plant: str, job: Job, body: Robot, first: int, 
 def _optional_engine(name: str, title: str, plant: str, package: str, differs: str) -> Engine:
     """Return an engine of an extra, one walk per process; `plant` is its class in sim/NAME.py."""
     walk = partial(walk_many, build=partial(_import_and_build, name, plant))
-    return Engine(name, title, walk, _double, ("sim.walk", f"sim.{name}"), package, differs)
+    modules = "sim.walk", f"sim.{name}"
+    return Engine(name, title, walk, modules=modules, package=package, differs=differs)
 
 
 DRAKE = _optional_engine(
@@ -87,7 +84,7 @@ DRAKE = _optional_engine(
     "Drake",
     "DrakePlant",
     package="drake",
-    differs="dry friction is smooth, a change of the plant lasts for the whole walk",
+    differs="dry friction is smooth",
 )
 """Drake: compliant contact, solved as a convex problem."""
 
@@ -96,8 +93,7 @@ PINOCCHIO = _optional_engine(
     "Pinocchio",
     "PinocchioPlant",
     package="pin",
-    differs="the floor is rigid, dry friction is smooth, legs pass through each other, a change of "
-    "the plant lasts for the whole walk",
+    differs="the floor is rigid, dry friction is smooth, legs pass through each other",
 )
 """Pinocchio: rigid contact with Coulomb's law."""
 

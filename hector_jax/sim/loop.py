@@ -24,7 +24,6 @@ from hector_jax.robot.description import Description
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 from hector_jax.sim import sensing
-from hector_jax.sim.changes import Change
 from hector_jax.sim.sensing import Ground, Touches
 from hector_jax.sim.world import NO_PUSH, Imperfections, Push
 
@@ -39,7 +38,6 @@ class Job(NamedTuple):
     seed: int = 0  # of the estimator's errors
     start_tick: int = 0  # gait tick of t = 0: the phase at which the command starts
     push: Push = NO_PUSH
-    changes: tuple[Change, ...] = ()  # of the plant
     plant: Robot | None = None  # another model that walks in place of the controller's own
 
     def body(self, robot: Robot) -> Robot:

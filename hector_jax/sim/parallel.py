@@ -46,18 +46,9 @@ class _Program:
     places: mjx_model.Places
     last_start: int  # latest start tick of the batch
     ticks: int  # from t = 0
-    fine: bool  # samples of 1 ms
+    substeps: int  # milliseconds in a tick
+    period: int  # milliseconds in a sample
     single: bool  # physics in 32 bits
-
-    @property
-    def substeps(self) -> int:
-        """Milliseconds in a tick."""
-        return substeps(self.config)
-
-    @property
-    def period(self) -> int:
-        """Milliseconds in a sample."""
-        return 1 if self.fine else self.substeps
 
 
 class _Walk(NamedTuple):
@@ -273,9 +264,6 @@ def _check_batch(jobs: Sequence[Job]) -> None:
         raise InputError(
             "engine mjx knows its state exactly: expected a plant whose estimator errs 0"
         )
-    changing = [i for i, job in enumerate(jobs) if job.changes]
-    if changing:
-        raise InputError(f"engine mjx: a plant cannot change, got changes of jobs {changing}")
 
 
 def _in_chunks(batch: Any, count: int, chunk: int, walk: Any) -> Iterator[Trajectory]:
@@ -302,8 +290,7 @@ def walk_batch(
     Args:
         config: the controller.
         robot: its nominal robot; the plants are its MJCF, or that of the jobs.
-        jobs: walks of one length, on plants that do not change, without errors of the
-            estimator.
+        jobs: walks of one length, on plants without errors of the estimator.
         chunk: walks at once, at most; by default 32 on a CPU and 4096 elsewhere.
         fine: samples of 1 ms; by default one per tick, its effect the mean over the tick.
         single: physics in 32 bits; the controller keeps the precision of JAX.
@@ -312,8 +299,8 @@ def walk_batch(
         The walks (numpy) in the order of their jobs, as their chunks are done.
 
     Raises:
-        InputError: the joints of the jobs' plant are not those of the robot, or a plant changes or
-            has errors of the estimator.
+        InputError: the joints of the jobs' plant are not those of the robot, or a plant has
+            errors of the estimator.
         ValueError: the jobs differ in their plant's model, in length, in the pieces of their
             commands, in the number of their pushes or in their joints, or a number of a plant is
             out of its range; or a geom that may touch the floor has an unsupported shape.
@@ -337,6 +324,7 @@ def walk_batch(
         return job._replace(weights=weights, start_tick=start, plant=None)
 
     places, last_start = mjx_model.find_places(worlds[0]), max(int(job.start_tick) for job in jobs)
-    program = _Program(config, places, last_start, ticks, fine, single)
+    count = substeps(config)
+    program = _Program(config, places, last_start, ticks, count, 1 if fine else count, single)
     batch = stack([as_arrays(job) for job in jobs]), varied
     return _in_chunks(batch, len(jobs), chunk, partial(_walk_all, program, robot, model, qpos))

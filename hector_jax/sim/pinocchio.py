@@ -18,9 +18,9 @@ from hector_jax.robot.model import Robot
 from hector_jax.sim import bodies
 from hector_jax.sim.bodies import Body
 from hector_jax.sim.loop import Job
-from hector_jax.sim.plant import LEGS, OTHER, Plant, PointContacts, lasting_world
+from hector_jax.sim.plant import LEGS, OTHER, Plant, PointContacts
 from hector_jax.sim.sensing import Ground
-from hector_jax.sim.world import STOP_TIME, World, standing_qpos
+from hector_jax.sim.world import STOP_TIME, World, build_world, standing_qpos
 
 if not hasattr(pin, "ADMMConstraintSolver"):  # PyPI has a `pinocchio` of other people
     raise InputError(
@@ -43,11 +43,11 @@ _SHAPES = {
 
 
 class PinocchioPlant(Plant):
-    """A `Plant` in Pinocchio; its world is the same from the walk's start to its end."""
+    """A `Plant` in Pinocchio."""
 
     def __init__(self, job: Job, body: Robot, first: int, end: int) -> None:
         """Build as a `BuildPlant` does."""
-        world = lasting_world("pinocchio", job, body, first, end)
+        world = build_world(job.imperfections, body.description)
         robot = bodies.bodies(world)
         self.model, joint_of = _model(robot, world)
         hinges = [hinge for part in robot for hinge in part.hinges]

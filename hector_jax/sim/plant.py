@@ -10,12 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.core.inputs import InputError
 from hector_jax.robot.model import Robot
-from hector_jax.sim.changes import worlds_by_step
 from hector_jax.sim.loop import Job
 from hector_jax.sim.sensing import Ground, Touches
-from hector_jax.sim.world import World, build_world
 
 
 class Plant(ABC):
@@ -87,19 +84,3 @@ class PointContacts:
         np.add.at(force, index, rows[:, 2:5])
         np.add.at(moment, index, np.cross(rows[:, 5:], rows[:, 2:5]))
         return Ground(force, moment, Touches(other, legs))
-
-
-def lasting_world(engine: str, job: Job, body: Robot, first: int, end: int) -> World:
-    """Return the world of a walk for an engine whose plants cannot change during it.
-
-    Raises:
-        InputError: a change begins or ends within the walk, or a number of it is out of its range.
-    """
-    world = build_world(job.imperfections, body.description)
-    worlds = worlds_by_step(world, job.changes, first, end)
-    if len(worlds) > 1:
-        raise InputError(
-            f"engine {engine}: a plant cannot change during a walk; expected changes that last "
-            "from its start to its end"
-        )
-    return worlds[first]

@@ -20,7 +20,7 @@ import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 
 from hector_jax.control import controller
-from hector_jax.control.controller import Memory, Plan, Retune, WalkConfig
+from hector_jax.control.controller import Memory, Plan, WalkConfig
 from hector_jax.control.parameters import Parameters
 from hector_jax.control.reference import Anchor, anchor_at, standing_anchor, with_pieces
 from hector_jax.control.weights import Weights
@@ -144,7 +144,7 @@ def walk(
     job: Job,
     *,
     build: BuildPlant = MujocoPlant,
-    retune: Retune | None = None,
+    retune: Callable[..., Weights] | None = None,
 ) -> Trajectory:
     """Walk once, by default in MuJoCo C.
 
@@ -154,7 +154,8 @@ def walk(
         job: the walk.
         build: builds the plant in an engine.
         retune: returns the weights of plans and legs at each tick from t = 0 on, instead of the
-            job's; called for up to nine ticks after a fall too.
+            job's, from gait tick, anchor, measurement and the wrench commanded over the previous
+            tick; called for up to nine ticks after a fall too.
 
     Returns:
         Samples of 1 ms from t = 0 (numpy). After a fall they repeat the last valid sample and are
@@ -167,12 +168,24 @@ def walk(
     count, ticks = substeps(config), loop.walk_ticks(config, job.seconds, job.start_tick)
     lead, length = (job.start_tick - first_tick(config)) * count, ticks * count
     plant = build(job, job.body(robot), -lead, length)
-    plans, samples = zip(*_walk_blocks(config, robot, job, plant, ticks, retune), strict=True)
-    return _trajectory(plans, samples, count, lead, length, plant.broken)
+    blocks = zip(*_walk_blocks(config, robot, job, plant, ticks, retune), strict=True)
+    plan, flat = (jax.tree.map(lambda *x: np.concatenate(x), *trees) for trees in blocks)
+    # from a fall on, samples repeat the last valid one
+    fell, good = np.flatnonzero(flat.fallen), len(flat.fallen) - 1
+    if len(fell):
+        good = max(fell[0] - 1, 0)
+    elif plant.broken:  # the engine warned within the last tick and the state does not show it
+        good = max(len(flat.fallen) - count - 1, 0)
+    steps = lead + np.arange(length)
+    rows = np.minimum(steps, good)
+    initial = jax.tree.map(lambda x: x[min(lead - 1, good)], flat.state)
+    plan = jax.tree.map(lambda x: x[rows // count], plan)
+    chosen = jax.tree.map(lambda x: x[rows], flat)._replace(fallen=steps > good)
+    return loop.as_trajectory(np.array(TIME_STEP), initial, plan, chosen)
 
 
 def _walk_blocks(
-    config: WalkConfig, robot: Robot, job: Job, plant: Plant, ticks: int, retune: Retune | None
+    config: WalkConfig, robot: Robot, job: Job, plant: Plant, ticks: int, retune: Any
 ) -> Iterator[tuple[Plan, Sample]]:
     """Yield plans and samples of each block of ticks (numpy), until t = `ticks` or a fall."""
     count, first = substeps(config), first_tick(config)
@@ -194,7 +207,7 @@ def _walk_blocks(
     packed_anchor, packed_constants, packed_state, packed = map(_pack, trees)
     planner_for = cache(partial(_planner, config, of_constants, of_inputs))
     memory_size = packed.size
-    carry, torques, planner, step = None if retune is None else retune.init, None, None, 0
+    torques, planner, step = None, None, 0
     while step < steps:
         begin, plans, at_start = step, [], []
         for _ in range(_BLOCK if steps - step >= _BLOCK * count else 1):
@@ -205,7 +218,7 @@ def _walk_blocks(
             if retune is not None and planner is not None and tick >= start:
                 measurement, _ = _measure(body, reading, yaw, error)
                 wrench = unpack(planner.layout, np.asarray(packed))[1].wrench
-                carry, weights = retune.step(carry, tick, anchor, measurement, wrench)
+                weights = retune(tick, anchor, measurement, wrench)
                 packed_constants = _pack((body, _parameters(config, weights), *constants[2:]))
             at_start.append((anchor, np.int32(tick), yaw))
             planner = planner_for(controller.contacts_needed(config, tick))
@@ -229,29 +242,6 @@ def _walk_blocks(
         yield unpack(planner.layout, np.stack(plans))[1], jax.tree.map(np.asarray, samples)
         if plant.broken or np.asarray(samples.fallen).any():
             return
-
-
-def _trajectory(
-    plans: Sequence[Plan],
-    samples: Sequence[Sample],
-    count: int,
-    lead: int,
-    length: int,
-    broken: bool,
-) -> Trajectory:
-    """Return the samples from t = 0 on; from a fall on they repeat the last valid one."""
-    plan, flat = (jax.tree.map(lambda *x: np.concatenate(x), *trees) for trees in (plans, samples))
-    fell, good = np.flatnonzero(flat.fallen), len(flat.fallen) - 1
-    if len(fell):
-        good = max(fell[0] - 1, 0)
-    elif broken:  # the engine warned within the last tick and the state does not show it
-        good = max(len(flat.fallen) - count - 1, 0)
-    steps = lead + np.arange(length)
-    rows = np.minimum(steps, good)
-    initial = jax.tree.map(lambda x: x[min(lead - 1, good)], flat.state)
-    plan = jax.tree.map(lambda x: x[rows // count], plan)
-    chosen = jax.tree.map(lambda x: x[rows], flat)._replace(fallen=steps > good)
-    return loop.as_trajectory(np.array(TIME_STEP), initial, plan, chosen)
 
 
 def on_host(job: Job) -> Job:

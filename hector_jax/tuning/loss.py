@@ -29,7 +29,7 @@ from jaxtyping import Bool, Float
 from hector_jax.core.arrays import Array
 from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError, short_repr, unknown
-from hector_jax.core.settings import NOT_NEGATIVE, validation_error
+from hector_jax.core.settings import NOT_NEGATIVE, convert
 from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.robot.description import Description
 
@@ -156,8 +156,7 @@ def check_loss(loss: Any) -> None:
             f"{what} must have terms of unlike names L_..., got {short_repr(tuple(names))}"
         )
     for term in loss:
-        if error := validation_error(term.weight, float, NOT_NEGATIVE):
-            raise InputError(f"{what}: {term.name} {error}")
+        convert(term.weight, float, NOT_NEGATIVE, f"{what}: {term.name}")
 
 
 _KEYS = {"L_Eul": "euler", "L_pos": "position"}  # keys of the weights in files

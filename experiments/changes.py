@@ -1,4 +1,4 @@
-"""Changes of the plant during a walk: payload, slippery floor, slope.
+"""Walks on plants that change on the way: payload, slippery floor, slope.
 
 A change lasts for a part of the walk and is unknown to the controller. MuJoCo C switches from one
 model to the next and keeps the state: a new payload moves with the trunk at once.
@@ -9,17 +9,28 @@ controller takes the floor for level: it does not know the component of the weig
 as with an attitude estimate that was set to zero on the slope.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
 from copy import copy
 from dataclasses import replace
-from typing import NamedTuple
+from functools import partial
+from itertools import repeat
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
+from jaxtyping import Float
 
+from hector_jax.control.controller import WalkConfig
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import Trajectory
 from hector_jax.robot.links import rotation_of
 from hector_jax.robot.mjcf import TIME_STEP
+from hector_jax.robot.model import Robot
+from hector_jax.sim.loop import Job
+from hector_jax.sim.mujoco_plant import MujocoPlant
+from hector_jax.sim.walk import on_host, walk
 from hector_jax.sim.world import World
 
 TRUNK_TOP = (0.0, 0.0, 0.124)  # [m] in the trunk's frame
@@ -105,3 +116,48 @@ def worlds_by_step(
         return changed_world(world, active) if active else world
 
     return {step: world_at(step) for step in sorted(steps)}
+
+
+class ChangingPlant(MujocoPlant):
+    """A plant in MuJoCo C that changes during a walk."""
+
+    def __init__(
+        self,
+        job: Job,
+        body: Robot,
+        first: int,
+        end: int,
+        *,
+        changes: Sequence[Change],
+        **options: Any,
+    ) -> None:
+        """Build as a `BuildPlant` does; `options` are those of `MujocoPlant`."""
+        super().__init__(job, body, first, end, **options)
+        self._worlds, self._now = worlds_by_step(self.world, changes, first, end), first
+
+    def step(self, torque: Float[np.ndarray, " joints"], push: Float[np.ndarray, "3"]) -> None:
+        """See `Plant`."""
+        self.world = self._worlds.get(self._now, self.world)
+        self._now += 1
+        super().step(torque, push)
+
+
+def walk_with_changes(
+    config: WalkConfig, robot: Robot, job: Job, changes: Sequence[Change], **options: Any
+) -> Trajectory:
+    """Walk once on a plant that changes; `options` are those of `sim.walk.walk`."""
+    return walk(config, robot, job, build=partial(ChangingPlant, changes=changes), **options)
+
+
+def walk_all(
+    pool: Executor,
+    config: WalkConfig,
+    robot: Robot,
+    walks: Sequence[tuple[Job, Sequence[Change]]],
+) -> Iterator[Trajectory]:
+    """Walk all jobs, each with its changes, in a pool; yields the walks in order."""
+    jobs, changes = zip(*walks, strict=True)
+    host_robot = jax.tree.map(np.asarray, robot)
+    return pool.map(
+        walk_with_changes, repeat(config), repeat(host_robot), map(on_host, jobs), changes
+    )
