@@ -42,7 +42,7 @@ class Engine(NamedTuple):
     name: str  # in flags, logs and cards
     title: str  # in reports
     walk: Callable[..., Iterator[Trajectory]]
-    bits: Callable[[bool], int] = lambda exact: 64  # of the physics
+    bits: Callable[[bool], int]  # of the physics, by `exact`
     modules: tuple[str, ...] = ("sim.walk",)  # modules of this package that decide its numbers
     package: str = "mujoco"  # its Python package; the extra with the engine's name installs it
     # differences of its plants from MuJoCo C, for reports; empty means the same physics, and a walk
@@ -63,7 +63,11 @@ class Engine(NamedTuple):
             return None
 
 
-MUJOCO_C = Engine("c", "MuJoCo C", walk_many)
+def _double(exact: bool) -> int:
+    return 64
+
+
+MUJOCO_C = Engine("c", "MuJoCo C", walk_many, _double)
 """MuJoCo C, one walk per process."""
 
 
@@ -75,8 +79,7 @@ def _import_and_build(name: str, plant: str, job: Job, body: Robot, first: int, 
 def _optional_engine(name: str, title: str, plant: str, package: str, differs: str) -> Engine:
     """Return an engine of an extra, one walk per process; `plant` is its class in sim/NAME.py."""
     walk = partial(walk_many, build=partial(_import_and_build, name, plant))
-    modules = "sim.walk", f"sim.{name}"
-    return Engine(name, title, walk, modules=modules, package=package, differs=differs)
+    return Engine(name, title, walk, _double, ("sim.walk", f"sim.{name}"), package, differs)
 
 
 DRAKE = _optional_engine(
