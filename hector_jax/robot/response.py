@@ -25,7 +25,7 @@ from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot, build_model
 
 DELAY, LAG = 0.005, 0.006  # [s] of the slowest motors that the gains are made for
-PHASE_MARGIN = np.deg2rad(30.0)  # of the loops with these motors
+PHASE_MARGIN = np.deg2rad(20.0)  # of the loops with these motors
 _HELD = {"point": (), "line": (1, 2), "flat": (0, 1, 2)}  # rotations of a foot that contacts hold
 
 

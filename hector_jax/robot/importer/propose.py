@@ -14,7 +14,7 @@ of mass m and height h:
     feedback                 0.12 s sqrt(h / h0)
     height                   0.06 m h / 0.69 m for the swing foot; landing -0.005 m
     kp                       I w^2 with I the inertia at the joint with its motor and w the largest
-                             with which slow motors leave the joints a phase margin of 30 degrees
+                             with which slow motors leave the joints a phase margin of 20 degrees
                              (`response`); at most 2 / rad times the torque limit
     kd                       sqrt(kp I)
     mpc.inertia              that share which leaves the plan's attitude the same phase margin
