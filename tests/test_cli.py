@@ -559,7 +559,7 @@ def test_completion_prints_a_script_that_knows_the_commands(monkeypatch, capsys,
 def test_a_doctor_that_finds_a_fault_leaves_with_one(monkeypatch, capsys):
     walks = {"srbm": synthetic_walk(0, 30), "ideal": synthetic_walk(0, 30)}
     monkeypatch.setattr(doctor, "_walks", lambda robot: walks)
-    monkeypatch.setattr(doctor, "_film", lambda *args: "egl")
+    monkeypatch.setattr(doctor, "write_film", lambda *args: "egl")
     monkeypatch.setattr(doctor, "SOLVED", -1.0)
     assert call(monkeypatch, "doctor", "--json") == 1
     out, err = capsys.readouterr()
@@ -580,7 +580,7 @@ def test_the_doctor_names_an_engine_that_cannot_be_loaded(monkeypatch):
 def test_a_sound_machine_passes_the_doctor(monkeypatch, capsys):
     walks = {"srbm": synthetic_walk(0, 30), "ideal": synthetic_walk(0, 30)}
     monkeypatch.setattr(doctor, "_walks", lambda robot: walks)
-    monkeypatch.setattr(doctor, "_film", lambda *args: "egl")
+    monkeypatch.setattr(doctor, "write_film", lambda *args: "egl")
     assert call(monkeypatch, "doctor", "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert told["faults"] == []
