@@ -112,7 +112,9 @@ class MpcConfig:
             integral=gains,
         )
 
-    def planned_inertia(self, inertia: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    def planned_inertia(
+        self, inertia: Float[Array | np.ndarray, "3 3"]
+    ) -> Float[Array | np.ndarray, "3 3"]:
         """Return the inertia [kg m^2] that the plan turns, from that of the whole robot."""
         if self.inertia == (1.0, 1.0, 1.0):
             return inertia

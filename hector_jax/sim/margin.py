@@ -10,6 +10,7 @@ catch. The plan is that of the QP without constraints, with the present contacts
 from dataclasses import replace
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
 
@@ -53,7 +54,7 @@ class Loops(NamedTuple):
 
 def loops(robot: Robot, config: WalkConfig, weights: Weights) -> Loops:
     """Return the loops of a robot with a controller in the middle of a step."""
-    cycle = np.arange(config.gait.cycle)
+    cycle = jnp.arange(config.gait.cycle)
     contact = min(np.asarray(gait.contact(config.gait, cycle)), key=np.sum)
     answer = response(robot, np.flatnonzero(contact).tolist())
     N, size = answer.motions, answer.motions.shape[1]

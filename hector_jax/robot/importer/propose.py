@@ -58,7 +58,7 @@ from hector_jax.robot.response import (
 
 MASS, HEIGHT = 12.0, 0.423  # of HECTOR [kg], [m]
 _TICK = 0.01  # [s] of the gait
-_ANGLE, _RATE = 50, 1  # weights Q of attitude and angular velocity
+_ANGLE, _RATE = 50.0, 1.0  # weights Q of attitude and angular velocity
 _KP_PER_LIMIT = 2.0  # [1/rad]
 _NAMES = ("name", "model", "standing", "joints", "feet")  # what is found, not ruled
 _ARMATURE_PER_LIMIT = 2e-4  # [s^2]: HECTOR's has 2.4e-4, Unitree's robots 1e-4 to 4e-4
