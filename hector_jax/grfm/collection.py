@@ -130,7 +130,7 @@ def _read_collection(folder: Path) -> tuple[list[Path], dict[str, Any]]:
         raise InputError(f"{folder}: no finished collection (no card.json); collect first")
     try:
         card = read_json(path, "the card of a collection")
-        walks, settings = convert(card["walks"], int, _NUMBER), dict(card["settings"])
+        walks, settings = convert(card["walks"], int, _NUMBER), {**card["settings"]}
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: no card of a collection; collect again") from error
     paths = _paths(folder, walks)
