@@ -255,7 +255,8 @@ def test_curves_leave_a_gap_where_a_tick_is_no_sample():
 def test_either_engine_collects_the_same_walks(monkeypatch, tmp_path):
     """Both leave shards of one layout; the card names the engine, and resuming keeps to it."""
     monkeypatch.setattr(nets, "tuning_paths", lambda *args: [])
-    flags = ("collect", "--walks", "3", "--seconds", "0.1")
+    # with seed 0 a walk of MuJoCo C itself jumps by more, when its delay changes by a microsecond
+    flags = ("collect", "--walks", "3", "--seconds", "0.1", "--seed", "1")
     found = {}
     for engine in ("c", "mjx"):
         folder = tmp_path / engine
@@ -263,10 +264,8 @@ def test_either_engine_collects_the_same_walks(monkeypatch, tmp_path):
         settings = json.loads((folder / "card.json").read_text())["settings"]
         assert settings["engine"].split()[0] == engine
         found[engine] = load_walks(folder, load_robot())
-    pairs = zip(*map(jax.tree.leaves, found.values()), strict=True)
-    apart = [np.abs(1.0 * one - other).reshape(3, -1).max(axis=1) for one, other in pairs]
-    # in one of three walks a foot may land a millisecond earlier in one engine
-    assert np.sum(np.max(apart, axis=0) < 0.01) >= 2
+    for one, other in zip(*map(jax.tree.leaves, found.values()), strict=True):
+        np.testing.assert_allclose(one, other, atol=0.01)
     assert call(monkeypatch, *flags, "--engine", "mjx", "--out", tmp_path / "c") == 2
 
 
