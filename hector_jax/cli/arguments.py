@@ -85,12 +85,15 @@ def robot_folder(folder: Path, path: Path | None, robot: Robot) -> Path:
 def data_folder(folder: Path, path: Path | None, robot: Robot) -> Path:
     """Return `robot_folder`; with a hash of the robot if it has data of another robot."""
     named, own = robot_folder(folder, path, robot), tree_hash(robot, ROBOT_DIGITS)
+    if path is None:
+        return named
     apart = named.with_name(f"{named.name}-{own[:6]}")
-    if path is None or apart.exists():
-        return named if path is None else apart
+    if apart.exists():
+        return apart
+    first = min(named.rglob("*.npz"), default=None)
     with suppress(InputError):  # a damaged file is told where it is used
-        for file in sorted(named.rglob("*.npz"))[:1]:
-            return named if read_card(file)["robot"] in (None, own) else apart
+        if first is not None and read_card(first)["robot"] not in (None, own):
+            return apart
     return named
 
 

@@ -137,8 +137,9 @@ def _tune_in(folder: Path, args: Tune) -> None:
     net = nets.load_net(args.net, robot, args.variant)[0] if args.net else None
     with workers(args.processes) as pool:
         setup = Setup(pool, config, robot, made_with.get("commit", ""))
-        _check_start(setup, args.start, start, trajectories, folder / _ARTEFACTS / "hfs")
-        for line in tunings.compile_programs(pool, config, robot, start, trajectories[0]):
+        inputs = setup, args.start, start, trajectories, folder / _ARTEFACTS / "hfs"
+        check, program = partial(_check_start, *inputs), (config, robot, start, trajectories[0])
+        for line in tunings.compile_programs(pool, *program, meanwhile=check):
             say(f"before any tuning, {trajectories[0].name} on hfs: {line}")
         net = net or nets.load_or_train(pool, robot, data, args.variant)
         run = _Run(setup, folder, args, start, trajectories, net)

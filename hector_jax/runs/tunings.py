@@ -270,7 +270,13 @@ def _prepare_tuning(
 
 
 def compile_programs(
-    pool: Executor, config: TuneConfig, robot: Robot, start: Weights, trajectory: NamedCommand
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    start: Weights,
+    trajectory: NamedCommand,
+    *,
+    meanwhile: Callable[[], None] = lambda: None,
 ) -> list[str]:
     """Compile the programs of a tuning in one process; walk once and trace them in another one.
 
@@ -280,6 +286,7 @@ def compile_programs(
     Args:
         pool: worker processes.
         config, robot, start, trajectory: of the tuning.
+        meanwhile: what is done at the same time; its jobs come after the walk.
 
     Raises:
         InputError: with the weights at the start the model falls or a QP is not solved.
@@ -288,9 +295,10 @@ def compile_programs(
     job = on_host(job._replace(seconds=trajectory.seconds or job.seconds))
     on_hfs = config.rollout.walk, jax.tree.map(np.asarray, robot), job
     inputs = config, robot, start, trajectory.command
+    walking = pool.submit(not_the_weights, *on_hfs)
+    tuning = pool.submit(_prepare_tuning, *inputs, False)
+    meanwhile()
     with bar("compiling, once on a machine") as report_progress:
-        walking = pool.submit(not_the_weights, *on_hfs)
-        tuning = pool.submit(_prepare_tuning, *inputs, False)
         pool.submit(_prepare_tuning, *inputs, True)  # by a free process; `tuning` raises its errors
         for done, future in enumerate((walking, tuning)):
             report_progress(done, 2, "")

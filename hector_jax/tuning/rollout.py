@@ -278,10 +278,8 @@ def step_carry(
     commands = jax.tree.map(
         lambda new, old: jnp.concatenate([new[None], old[:-1]]), planned.wrench, carry.commands
     )
-    since, yaw = (
-        gait.since_switch(walk.gait, tick),
-        carry.state.euler[2],
-    )  # phi's frame is the yaw's
+    since = gait.since_switch(walk.gait, tick)
+    yaw = carry.state.euler[2]  # the frame of phi turns with it
     window = Window(turn(commands, -yaw), planned.contact, since, from_yaw_frame(carry.state))
     response = turn(effect(window), yaw)
     response, feet = _on_real_ground(carry, response, planned, error, variation)
