@@ -17,16 +17,20 @@ from unittest import mock
 import jax
 import numpy as np
 import pytest
+from delay import AS_PROPOSED, BEFORE
 from model import BEST_OTHERS
 from table import PROGRAM, SETS
 from table import Flags as Table
 
 import hector_jax
 from hector_jax.cli import flags, parse
+from hector_jax.control.controller import walk_config
 from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.reference import COMMANDS
-from hector_jax.control.weights import between
+from hector_jax.control.weights import between, nominal
 from hector_jax.control.weights_file import best, load_weights
+from hector_jax.robot.model import load_robot
+from hector_jax.sim.margin import delay_lines
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -328,13 +332,79 @@ def test_what_the_readme_says_of_pinocchio_and_other_robots_is_in_their_files():
             *gains, **sets["nominal"], cells=len(cells)
         )
     ) in text
+    tuned = {
+        name: {traj: of["sets"]["best"]["standin-even"] for traj, of in each.items()}
+        for name, each in robots.items()
+    }
     for name in ("quadruped", "humanoid"):
-        changes = [
-            of["sets"]["best"]["standin-even"]["change"]["nominal"] for of in robots[name].values()
-        ]
+        changes = [one["change"]["nominal"] for one in tuned[name].values()]
         assert all(change["high"] < 0 for change in changes)
-        medians = sorted(-round(change["median"]) for change in changes)
+        medians = sorted(-round(change["median"]) for change in changes if change["counts"])
         assert f"{medians[0]} to {medians[-1]} % on a {name}" in text
+    assert [traj for traj, one in tuned["humanoid"].items() if one["falls"]] == ["s"]
+    straight = tuned["h1"]["straight"]["change"]["nominal"]
+    assert straight["low"] < 0 < straight["high"]
+    assert "on a humanoid, which falls on S, and on Unitree H1 nothing on straight" in text
+
+
+def shown_change(sets, world):
+    """Change of `best` against nominal as a cell of the page of results has it."""
+    start, tuned = (sets[name][world] for name in ("nominal", "best"))
+    change, falls = tuned["change"]["nominal"], (start["falls"], tuned["falls"])
+    text = "{median:+.0f} [{low:+.0f}, {high:+.0f}]".format(**change)
+    assert change["counts"] == (falls == (0, 0))
+    return text if change["counts"] else f"{text}; nominal fell {falls[0]} times, `best` {falls[1]}"
+
+
+def test_the_table_of_other_robots_is_that_of_its_file():
+    robots = json.loads((DOCS / "results" / "robots.json").read_text())
+    names = {
+        "quadruped": "`examples/quadruped`",
+        "go2": "Unitree Go2",
+        "humanoid": "`examples/humanoid`",
+        "h1": "Unitree H1",
+    }
+    assert robots["all"].keys() == names.keys()
+    page = " ".join((DOCS / "results.md").read_text().split())
+    for robot, name in names.items():
+        each = [robots["all"][robot][traj]["sets"] for traj in COMMANDS]
+        assert all(sets["best"]["standin-even"] == sets["with"]["standin-even"] for sets in each)
+        cells = [shown_change(sets, "standin-even") for sets in each]
+        assert f"| {' | '.join([name, *cells])} |" in page
+    go2, g1 = (
+        shown_change(robots["straight"][robot]["straight"]["sets"], "standin")
+        for robot in ("go2", "g1")
+    )
+    assert f"Go2 is at {go2} and Unitree G1 at {g1} %, and nothing falls" in page
+
+
+def test_the_table_of_late_motors_is_that_of_its_reports():
+    page = (DOCS / "decisions.md").read_text()
+    table = page.partition("| robot, trajectory | controller |")[2].partition("\n\n")[0]
+    shown = [line.split("|")[2:-1] for line in table.splitlines()[2:]]
+    expected = []
+    for report in ("quadruped", "quadruped-s", "humanoid"):
+        numbers = json.loads((DOCS / "delay" / report / "delay.json").read_text())
+        (trajectories,) = numbers["walks"].values()
+        (changes,) = trajectories.values()
+        motors = list(zip(numbers["delays"], numbers["lags"], strict=True))
+        for name, change in {"whole, 30 rad/s": BEFORE, "as proposed": AS_PROPOSED}.items():
+            cells = [name]
+            for column in ((2.0, 4.0), (5.0, 6.0), (8.0, 6.0)):
+                walks = changes[change][motors.index(column)]
+                loss = np.median([walk["L"] for walk in walks]) / 1e6
+                falls = sum(walk["fell"] for walk in walks)
+                cells.append(f"{loss:#.3g}".rstrip(".") if loss > 10 else f"{loss:.2f}")
+                cells[-1] += f", {falls} fell" if falls else ""
+            expected.append(cells)
+    assert [[cell.strip() for cell in cells] for cells in shown] == expected
+
+
+def test_the_page_of_robots_shows_the_delay_that_the_quadruped_bears():
+    robot = load_robot(ROOT / "examples" / "quadruped" / "robot.toml")
+    lines = delay_lines(robot, walk_config(robot), nominal(robot))
+    page = (DOCS / "howto" / "robot.md").read_text()
+    assert f"    delay    {lines[0]}\n             {lines[1]}\n" in page
 
 
 @pytest.mark.parametrize("path", READ, ids=lambda path: path.stem)
