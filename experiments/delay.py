@@ -28,8 +28,8 @@ from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, Range, check
 from hector_jax.report.report import markdown_table
-from hector_jax.robot.importer.propose import size_of
 from hector_jax.robot.model import Robot, load_robot
+from hector_jax.robot.response import response
 from hector_jax.runs import metrics
 from hector_jax.sim.loop import Job
 from hector_jax.sim.margin import loops, modes
@@ -58,7 +58,7 @@ def _whole(config: WalkConfig) -> WalkConfig:
 def _before(robot: Robot, config: WalkConfig) -> WalkConfig:
     """Return the controller as it was proposed before: w = 30 rad/s, the whole inertia."""
     legs = len(robot.foot_point)
-    inertia = size_of(robot.description, robot).inertia.reshape(legs, -1).mean(axis=0)
+    inertia = response(robot).inertia.reshape(legs, -1).mean(axis=0)
     most = 2.0 * robot.torque_limit.reshape(legs, -1).min(axis=0)
     kp = np.minimum(900.0 * inertia, most)
     gains = {"kp": tuple(kp.tolist()), "kd": tuple(np.sqrt(kp * inertia).tolist())}

@@ -23,7 +23,7 @@ from hector_jax.robot.description import (
     description_of,
     read_description,
 )
-from hector_jax.robot.importer.propose import HEIGHT, MASS, propose, size_of
+from hector_jax.robot.importer.propose import HEIGHT, MASS, propose
 from hector_jax.robot.importer.remarks import remarks
 from hector_jax.robot.importer.soles import find_soles
 from hector_jax.robot.importer.survey import survey_file
@@ -201,7 +201,7 @@ def test_the_standing_pose_bends_the_knees_and_balances_on_level_soles(humanoid)
 
 def test_gains_follow_from_what_hangs_at_a_joint(humanoid):
     proposal, description, robot, config = humanoid
-    I = size_of(description, robot).inertia[: description.leg_joints]  # noqa: E741
+    I = response(robot).inertia[: description.leg_joints]  # noqa: E741
     kp, kd = np.array(config.legs.kp), np.array(config.legs.kd)
     most = 2.0 * robot.torque_limit[: description.leg_joints]
     w = swing_frequency(response(robot))
