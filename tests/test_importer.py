@@ -222,6 +222,22 @@ def test_legs_that_are_no_mirror_images_are_told_joint_by_joint(tmp_path, kind):
         )
 
 
+def test_the_last_line_names_the_joint_for_which_soles_are_not_level(monkeypatch, capsys, tmp_path):
+    path = edited(tmp_path, (KNEE + '2"', 'right_knee" axis="0 1 0" range="-2 0.1"'))
+    assert command(monkeypatch, path) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    named = r"left_knee and right_knee are no mirror images: range \[rad\] -0.1, 2 and -2, 0.1"
+    assert re.match(rf"hector: {named}; .*the soles are not level", last)
+
+
+def test_a_draft_of_a_file_that_is_no_text_is_written_too(monkeypatch, capsys, tmp_path):
+    path, out = tmp_path / "scan.xml", tmp_path / "draft" / "scan.toml"
+    path.write_bytes(b"\xff\xfe<mujoco/>")
+    assert command(monkeypatch, path, "--out", out) == 2
+    assert str(path) in capsys.readouterr().err
+    assert out.with_name("scan.xml").read_bytes() == path.read_bytes()
+
+
 def test_opposite_axes_of_mirrored_joints_are_alike(tmp_path):
     """A joint that turns the other way has the other range."""
     knee = 'right_knee" axis="0 1 0" range="-0.1 2"', 'right_knee" axis="0 -1 0" range="-2 0.1"'
