@@ -32,7 +32,7 @@ from hector_jax.robot.model import Robot, load_robot
 from hector_jax.robot.response import response
 from hector_jax.runs import metrics
 from hector_jax.sim.loop import Job
-from hector_jax.sim.margin import loops, modes
+from hector_jax.sim.margin import loops, modes, step_response
 from hector_jax.sim.walk import walk_many
 from hector_jax.sim.world import MAX_DELAY, Imperfections, hfs, truth
 from hector_jax.tuning.loss import loss_of_robot
@@ -144,7 +144,8 @@ def _cell(walks: list[dict[str, float]]) -> str:
 
 def root_locus(robot: Robot, change: str) -> list[list[tuple[float, float]]]:
     """Return growth [1/s] and frequency [Hz] of the modes with each delay of LOCUS."""
-    parts = loops(robot, CHANGES[change](robot, walk_config(robot)), nominal(robot))
+    config = CHANGES[change](robot, walk_config(robot))
+    parts = loops(robot, config, nominal(robot), step_response(robot, config))
     found = [modes(parts, delay) for delay in LOCUS]
     return [[(float(m.real), float(m.imag) / (2 * np.pi)) for m in each] for each in found]
 
