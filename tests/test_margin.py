@@ -124,6 +124,7 @@ def test_the_plan_turns_its_share_of_the_inertia():
     config = MpcConfig(inertia=(0.25, 1.0, 0.49))
     found = config.planned_inertia(np.ones((3, 3)))
     np.testing.assert_allclose(found[0], [0.25, 0.5, 0.35])
+    assert config.planned_inertia(np.ones((3, 3), np.float32)).dtype == np.float32
     with pytest.raises(InputError, match=r"MpcConfig.inertia must be .* above 0 and at most 1"):
         MpcConfig(inertia=(0.0, 1.0, 1.0))
     with pytest.raises(InputError, match="MpcConfig.inertia must be 3 numbers"):
