@@ -207,4 +207,4 @@ def test_the_rules_of_the_gains_bear_the_delay_that_made_the_legs_cycle():
 def test_a_robot_that_stands_has_no_swing_leg_to_shake():
     config = walk_config(QUADRUPED)
     still = replace(config, gait=replace(config.gait, stance=20, swing=0))
-    assert np.isfinite(modes(loops_of(QUADRUPED, still), 0.002)).all()
+    assert modes(loops_of(QUADRUPED, still), 0.002).real.max() < 0.0
