@@ -414,6 +414,25 @@ def test_legs_that_a_file_names_are_taken(tmp_path):
     assert "left_ankle" in proposal.table["joints"]["weld"]
 
 
+LEG = '["left_roll", "left_pitch", "left_knee"]'
+
+
+@pytest.mark.parametrize(
+    ("joints", "error"),
+    [
+        ("left = 3", "left must be a list, each text, got 3"),
+        (f"left = {LEG}", "must have left, right; or front_left, .*, got left"),
+        (f"left = {LEG}\nright = {LEG}\nfront_left = {LEG}", "got left, right, front_left"),
+        (f'left = {LEG}\nright = ["right_roll"]', "must be 3 to 7 names each and as many in both"),
+        (f"left = {LEG}\nright = {LEG}", "must be different names, got 'left_roll' twice"),
+    ],
+)
+def test_legs_that_a_file_names_are_checked_before_they_are_taken(tmp_path, joints, error):
+    path = tmp_path / "own.toml"
+    path.write_text(f'model = "{edited(tmp_path).name}"\n[joints]\n{joints}\n')
+    assert re.match(f"{path}: joints: .*{error}", refused(path))
+
+
 @pytest.mark.parametrize("kind", ["line", "point", "flat"])
 def test_the_standard_form_is_read_as_it_is_and_is_the_same_robot(monkeypatch, tmp_path, kind):
     model, out = edited(tmp_path), tmp_path / "new.toml"

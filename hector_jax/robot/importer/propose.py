@@ -36,9 +36,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hector_jax.core.inputs import InputError
-from hector_jax.core.settings import read_toml
+from hector_jax.core.settings import from_table, read_toml
 from hector_jax.core.trajectory import FEET
-from hector_jax.robot.description import MAX_BYTES, Description, description_of
+from hector_jax.robot.description import MAX_BYTES, Description, Joints, description_of
 from hector_jax.robot.importer.soles import Sole, find_soles
 from hector_jax.robot.importer.stand import standing_pose
 from hector_jax.robot.importer.survey import Survey, survey_file
@@ -84,12 +84,11 @@ def propose(path: Path) -> Proposal:
         own = read_toml(path, "the robot description", MAX_BYTES)
         if not isinstance(own.get("model"), str):
             description_of(path, own)  # refuses it
-    joints, wrong, error = own.get("joints"), [], None
-    joints = joints if isinstance(joints, dict) else {}
-    named = [list(map(str, joints[leg])) for leg in sum(FEET.values(), ()) if leg in joints]
+    wrong, error = [], None
     stem = "".join(x if x.isalnum() or x in "-_" else "-" for x in path.stem)
     found = Proposal({"name": stem, **own}, (), [])
     try:
+        named = _named_legs(path, own)
         if not (named and "feet" in own and "standing" in own):
             found = _with_legs(survey_file(path.with_name(own["model"]), named), found)
             found = _with_feet(found, wrong)
@@ -125,6 +124,14 @@ def standard_form(proposal: Proposal, model: str) -> tuple[dict[str, Any], str]:
     }
     named = {"standing": description.standing_key, "joints": joints, "feet": feet}
     return table | {"model": model} | named, build_model(description)[0].to_xml()
+
+
+def _named_legs(path: Path, own: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Return the joints of each leg that a TOML file names; none if they are to be found."""
+    joints = own.get("joints", {})
+    if isinstance(joints, dict) and not {*joints} & {*sum(FEET.values(), ())}:
+        return []
+    return list(from_table(f"{path}: joints", Joints, joints).legs.values())
 
 
 def _with_legs(survey: Survey, found: Proposal) -> Proposal:
