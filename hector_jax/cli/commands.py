@@ -22,7 +22,7 @@ from hector_jax.report.compare import compare_runs, print_comparison
 from hector_jax.robot.importer.propose import Proposal, standard_form
 from hector_jax.robot.importer.propose import propose as propose_robot
 from hector_jax.robot.importer.remarks import differences, remarks
-from hector_jax.robot.importer.table import changes, table_of
+from hector_jax.robot.importer.table import changes, section, table_of
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import export, nets, searches, tunings
 from hector_jax.runs.folder import RESULT, load_run, read_request
@@ -157,13 +157,15 @@ def examine_robot(args: flags.Robot) -> None:
             try:
                 loss_of_robot(robot.description)
                 inputs = robot, walk_config(robot), nominal(robot)
-                lines += _list("delay", margin.delay_lines(*inputs))
+                lines += section("delay", margin.delay_lines(*inputs))
             except InputError as error:  # a setting that controller or loss refuse
                 wrong.append(str(error))
-        lines += _list("mended", changes(robot))
+        lines += section("mended", changes(robot))
     if file.suffix == ".toml" and proposal.filled:
-        lines += _list("left out", [f"{', '.join(proposal.filled)}: HECTOR's, below by the rules"])
-    print("\n".join([*lines, *_list("wrong", [*told, *wrong])]))
+        lines += section(
+            "left out", [f"{', '.join(proposal.filled)}: HECTOR's, below by the rules"]
+        )
+    print("\n".join([*lines, *section("wrong", [*told, *wrong])]))
     head = f"Proposed by `hector robot {file.name}`; rules: docs/howto/robot.md."
     comments = [head, *(f"To be mended: {line}" for line in [*told, *wrong] if wrong)]
     if out is not None:
@@ -193,11 +195,6 @@ def _write_robot(out: Path, proposal: Proposal, comments: Sequence[str], file: P
     if content is not None:
         write_file(model, content)
     write_file(out, as_toml(table, comments).encode())
-
-
-def _list(title: str, lines: Sequence[str]) -> list[str]:
-    """Format lines under a title."""
-    return [f"{'' if i else title:8s} {line}" for i, line in enumerate(lines or ["nothing"])]
 
 
 @run.register

@@ -196,6 +196,8 @@ def _settings(robot: Robot) -> dict[str, Any]:
     ticks = round(20 * root)
     four, flat = len(robot.foot_point) == 4, robot.structure.contact == "flat"
     step_ticks, answer = max(3, math.ceil(0.15 * ticks)), response(robot)
+    step, gain = _TICK * step_ticks, trunk_gain(robot, answer)
+    inertia = planned_inertia(gain, angle=_ANGLE, rate=_RATE, step=step, tick=_TICK)
     aside = float(np.abs(answer.lever[:, 1]).mean())
     return {
         "limits": {"min_height": round(0.55 * height, 2)},
@@ -205,7 +207,7 @@ def _settings(robot: Robot) -> dict[str, Any]:
             "max_force": float(f"{2.5 * weight:.2g}"),
             "effort_reference": "gravity",
             **({"sole_width": 0.6} if flat else {}),
-            "inertia": _inertia(robot, answer, _TICK * step_ticks),
+            "inertia": inertia.round(2).tolist(),
         },
         "footstep": {
             "width": round((0.7 if four else 0.85) * aside, 3),
@@ -244,13 +246,6 @@ def _armature(description: Description) -> list[float] | None:
     default = _ARMATURE_PER_LIMIT * model.actuator_ctrlrange[:count, 1]
     complete = np.all(armature)
     return None if complete else [_short(x) for x in np.where(armature, armature, default)]
-
-
-def _inertia(robot: Robot, answer: Response, step: float) -> list[float]:
-    """Return the shares of the inertia with which an MPC of a step [s] plans."""
-    gain = trunk_gain(robot, answer)
-    shares = planned_inertia(gain, angle=_ANGLE, rate=_RATE, step=step, tick=_TICK)
-    return [round(float(share), 2) for share in shares]
 
 
 def _gains(robot: Robot, answer: Response) -> dict[str, list[float]]:
