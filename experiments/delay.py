@@ -28,11 +28,11 @@ from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, Range, check
 from hector_jax.report.report import markdown_table
-from hector_jax.robot.importer.propose import size_of
 from hector_jax.robot.model import Robot, load_robot
+from hector_jax.robot.response import response
 from hector_jax.runs import metrics
 from hector_jax.sim.loop import Job
-from hector_jax.sim.margin import loops, modes
+from hector_jax.sim.margin import loops, modes, step_response
 from hector_jax.sim.walk import walk_many
 from hector_jax.sim.world import MAX_DELAY, Imperfections, hfs, truth
 from hector_jax.tuning.loss import loss_of_robot
@@ -58,7 +58,7 @@ def _whole(config: WalkConfig) -> WalkConfig:
 def _before(robot: Robot, config: WalkConfig) -> WalkConfig:
     """Return the controller as it was proposed before: w = 30 rad/s, the whole inertia."""
     legs = len(robot.foot_point)
-    inertia = size_of(robot.description, robot).inertia.reshape(legs, -1).mean(axis=0)
+    inertia = response(robot).inertia.reshape(legs, -1).mean(axis=0)
     most = 2.0 * robot.torque_limit.reshape(legs, -1).min(axis=0)
     kp = np.minimum(900.0 * inertia, most)
     gains = {"kp": tuple(kp.tolist()), "kd": tuple(np.sqrt(kp * inertia).tolist())}
@@ -144,7 +144,8 @@ def _cell(walks: list[dict[str, float]]) -> str:
 
 def root_locus(robot: Robot, change: str) -> list[list[tuple[float, float]]]:
     """Return growth [1/s] and frequency [Hz] of the modes with each delay of LOCUS."""
-    parts = loops(robot, CHANGES[change](robot, walk_config(robot)), nominal(robot))
+    config = CHANGES[change](robot, walk_config(robot))
+    parts = loops(robot, config, nominal(robot), step_response(robot, config))
     found = [modes(parts, delay) for delay in LOCUS]
     return [[(float(m.real), float(m.imag) / (2 * np.pi)) for m in each] for each in found]
 

@@ -23,7 +23,7 @@ from hector_jax.robot.description import (
     description_of,
     read_description,
 )
-from hector_jax.robot.importer.propose import HEIGHT, MASS, propose, size_of
+from hector_jax.robot.importer.propose import HEIGHT, MASS, propose
 from hector_jax.robot.importer.remarks import remarks
 from hector_jax.robot.importer.soles import find_soles
 from hector_jax.robot.importer.survey import survey_file
@@ -130,12 +130,23 @@ def meshes_only(folder):
     return path
 
 
-def test_soles_of_meshes_are_asked_for(tmp_path):
+def test_soles_of_meshes_are_asked_for(monkeypatch, capsys, tmp_path):
+    path, draft, out = (tmp_path / name for name in ("robot.xml", "draft.toml", "robot.toml"))
     proposal = propose(meshes_only(tmp_path))
     assert all(sole.guessed for sole in proposal.soles)
     (line,) = [line for line in proposal.wrong if "guessed" in line]
     assert line.startswith("no box, sphere, capsule or cylinder of body 'left_foot' collides")
     assert line.endswith("measure the sole and correct feet.left and feet.right")
+    assert call(monkeypatch, path, "--out", draft) == 2
+    err = capsys.readouterr().err
+    assert f"the proposal is in {draft}; mend it, then: hector robot {draft}" in err
+    assert err.endswith(f"hector: {line}\n")
+    assert f"# To be mended: {line}" in draft.read_text()
+    assert read_description(draft).model == path
+    # whoever leaves the contacts as they are takes them
+    assert call(monkeypatch, draft, "--out", out) == 0
+    assert f"walk with it: hector walk --robot {out}" in capsys.readouterr().err
+    assert read_description(out).model == tmp_path / "robot-standard.xml"
 
 
 def test_wrenches_act_in_the_middle_of_a_sole_with_a_short_heel(tmp_path):
@@ -201,7 +212,7 @@ def test_the_standing_pose_bends_the_knees_and_balances_on_level_soles(humanoid)
 
 def test_gains_follow_from_what_hangs_at_a_joint(humanoid):
     proposal, description, robot, config = humanoid
-    I = size_of(description, robot).inertia[: description.leg_joints]  # noqa: E741
+    I = response(robot).inertia[: description.leg_joints]  # noqa: E741
     kp, kd = np.array(config.legs.kp), np.array(config.legs.kd)
     most = 2.0 * robot.torque_limit[: description.leg_joints]
     w = swing_frequency(response(robot))
@@ -248,8 +259,13 @@ def test_a_toml_is_checked(monkeypatch, capsys, tmp_path):
     path = tmp_path / "robot.toml"
     path.write_text(STRIDER.read_text().replace("kp = [150, 150, 150, 150, 50]", "kp = [150]"))
     (tmp_path / "strider.xml").write_text(STRIDER.with_name("strider.xml").read_text())
-    assert call(monkeypatch, path) == 2
-    assert "legs.kp must be a gain for each of the 5 joints" in capsys.readouterr().err
+    out = tmp_path / "new.toml"
+    assert call(monkeypatch, path, "--out", out) == 2
+    printed, err = capsys.readouterr()
+    error = "legs.kp must be a gain for each of the 5 joints"
+    assert error in err
+    assert error in printed
+    assert re.search(f"(?m)^# To be mended: .*{error}", out.read_text())
 
 
 def test_a_proposal_is_written_once_and_beside_its_model(monkeypatch, capsys, tmp_path):

@@ -21,9 +21,9 @@ from hector_jax.grfm.training import TrainConfig
 from hector_jax.report.compare import compare_runs, print_comparison
 from hector_jax.robot.importer.propose import Proposal, standard_form
 from hector_jax.robot.importer.propose import propose as propose_robot
-from hector_jax.robot.importer.remarks import remarks
-from hector_jax.robot.importer.table import changes, table_of
-from hector_jax.robot.model import Robot, load_robot
+from hector_jax.robot.importer.remarks import differences, remarks
+from hector_jax.robot.importer.table import changes, section, table_of
+from hector_jax.robot.model import load_robot
 from hector_jax.runs import export, nets, searches, tunings
 from hector_jax.runs.folder import RESULT, load_run, read_request
 from hector_jax.runs.setup import Setup
@@ -141,7 +141,7 @@ def examine_robot(args: flags.Robot) -> None:
     """Check a robot's TOML, or propose one for its model.
 
     Raises:
-        InputError: the robot cannot be used; one line says what must be corrected.
+        InputError: one line says what must be corrected in the proposal.
     """
     file, out = args.file, args.out
     if out is not None:
@@ -150,29 +150,34 @@ def examine_robot(args: flags.Robot) -> None:
         if out.exists():
             raise InputError(f"--out must be a new file, and {out} exists")
     proposal = propose_robot(file)
-    error = proposal.error or _unfit(proposal.robot)
-    lines, told, is_toml = [], [], file.suffix == ".toml"
-    if proposal.robot is not None:
-        lines, told = table_of(proposal.robot), remarks(proposal.robot)
-        if not error:
-            inputs = proposal.robot, walk_config(proposal.robot), nominal(proposal.robot)
-            lines += _list("delay", margin.delay_lines(*inputs))
-        lines += _list("mended", changes(proposal.robot))
-    if is_toml and proposal.filled:
-        lines += _list("left out", [f"{', '.join(proposal.filled)}: HECTOR's, below by the rules"])
-    print("\n".join([*lines, *_list("wrong", [*told, *proposal.wrong])]))
+    robot, lines, told, wrong = proposal.robot, [], [], list(proposal.wrong)
+    if robot is not None:
+        lines, told = table_of(robot), remarks(robot)
+        if proposal.error is None:
+            try:
+                loss_of_robot(robot.description)
+                inputs = robot, walk_config(robot), nominal(robot)
+                lines += section("delay", margin.delay_lines(*inputs))
+            except InputError as error:  # a setting that controller or loss refuse
+                wrong.append(str(error))
+        lines += section("mended", changes(robot))
+    if file.suffix == ".toml" and proposal.filled:
+        lines += section(
+            "left out", [f"{', '.join(proposal.filled)}: HECTOR's, below by the rules"]
+        )
+    print("\n".join([*lines, *section("wrong", [*told, *wrong])]))
     head = f"Proposed by `hector robot {file.name}`; rules: docs/howto/robot.md."
-    wrong = [*told, *proposal.wrong] if error else proposal.wrong
-    comments = [head, *(f"To be mended: {line}" for line in wrong)]
-    text = as_toml(proposal.table, comments)
+    comments = [head, *(f"To be mended: {line}" for line in [*told, *wrong] if wrong)]
     if out is not None:
         _write_robot(out, proposal, comments, file)
-        next_step = f"mend it, then: hector robot {out}" if error else "walk with it: hector walk"
-        say(f"the proposal is in {out}; {next_step}{'' if error else f' --robot {out}'}")
+        next_step = "mend it, then: hector robot" if wrong else "walk with it: hector walk --robot"
+        say(f"the proposal is in {out}; {next_step} {out}")
     elif proposal.filled:
-        print(f"\n{text}", end="")
-    if error:
-        raise InputError(error)
+        print(f"\n{as_toml(proposal.table, comments)}", end="")
+    if wrong:
+        # why a robot of unlike legs does not stand
+        unlike = differences(robot)[:1] if robot is not None and proposal.error else []
+        raise InputError("; ".join([*unlike, wrong[-1]]))
 
 
 def _write_robot(out: Path, proposal: Proposal, comments: Sequence[str], file: Path) -> None:
@@ -180,31 +185,16 @@ def _write_robot(out: Path, proposal: Proposal, comments: Sequence[str], file: P
     table, name = proposal.table, str(proposal.table["model"])
     source, model = file.with_name(name), out.with_name(name)
     if proposal.wrong:
-        text = source.read_text() if source.exists() and not model.exists() else None
+        content = source.read_bytes() if source.is_file() and not model.exists() else None
     else:
         model = out.with_name(f"{out.stem}-standard.xml")
         if model.exists():
             raise InputError(f"--out writes {model}, which must be a new file, and it exists")
         table, text = standard_form(proposal, model.name)
-    if text is not None:
-        write_file(model, text.encode())
+        content = text.encode()
+    if content is not None:
+        write_file(model, content)
     write_file(out, as_toml(table, comments).encode())
-
-
-def _unfit(robot: Robot | None) -> str | None:
-    """Return why controller or loss cannot read a robot's settings."""
-    try:
-        if robot is not None:
-            walk_config(robot)
-            loss_of_robot(robot.description)
-    except InputError as error:
-        return str(error)
-    return None
-
-
-def _list(title: str, lines: Sequence[str]) -> list[str]:
-    """Format lines under a title."""
-    return [f"{'' if i else title:8s} {line}" for i, line in enumerate(lines or ["nothing"])]
 
 
 @run.register

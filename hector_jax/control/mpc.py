@@ -119,7 +119,7 @@ class MpcConfig:
         if self.inertia == (1.0, 1.0, 1.0):
             return inertia
         root = np.sqrt(self.inertia)
-        return inertia * np.outer(root, root)
+        return inertia * np.outer(root, root).astype(inertia.dtype)
 
     @property
     def contact_model(self) -> ContactModel:

@@ -177,7 +177,9 @@ def _by_leg(section: Any, default: Any) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class _Joints:
+class Joints:
+    """The section [joints] of a file."""
+
     left: tuple[str, ...] = ()
     right: tuple[str, ...] = ()
     front_left: tuple[str, ...] = ()
@@ -307,7 +309,7 @@ class _File:
     name: str | None = None
     model: str = ""
     standing: str | dict[str, float] = "standing"
-    joints: _Joints = _Joints(left=_joint_names("left"), right=_joint_names("right"))
+    joints: Joints = Joints(left=_joint_names("left"), right=_joint_names("right"))
     feet: _Feet | None = None
     limits: _Limits = _Limits()
     gait: dict | None = None

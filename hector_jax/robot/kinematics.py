@@ -115,14 +115,9 @@ def knee_joints(robot: Robot) -> tuple[int, int, int]:
     The knee is the joint that changes the leg's length most in the standing pose; hip and ankle are
     the joints nearest to it with parallel axes, or the first and the last joint.
     """
-    count, standing = robot.description.leg_joints, robot.standing_joints
-
-    def length(joints: np.ndarray) -> float:
-        foot = foot_poses(robot, jnp.asarray(joints)).position[0]
-        return float(np.linalg.norm(foot - robot.joint_origin[0, 0]))
-
-    steps = 1e-4 * np.eye(count, len(standing))
-    slopes = [abs(length(standing + step) - length(standing - step)) for step in steps]
+    count, standing = robot.description.leg_joints, jnp.asarray(robot.standing_joints)
+    leg = foot_poses(robot, standing).position[0] - robot.joint_origin[0, 0]
+    slopes = np.abs(leg @ foot_jacobians(robot, standing)[0][0])  # of half the squared length
     knee = int(np.argmax(slopes[1:])) + 1
     parallel = np.abs(robot.joint_axis[0] @ robot.joint_axis[0, knee]) > 0.9
     above, below = np.flatnonzero(parallel[:knee]), np.flatnonzero(parallel[knee + 1 :])

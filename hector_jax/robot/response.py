@@ -173,5 +173,5 @@ def planned_inertia(
     kappa = p * step / (ratio + p * step**2)
     damping = (1.0 + kappa * step) / step
     largest = largest_gain(kappa / (1.0 + kappa * step), tick)
-    answered = np.maximum(gain, 1e-9)  # none about an axis that the legs cannot turn
-    return np.minimum(1.0, largest / (damping * answered))
+    # all of it about an axis that the legs cannot turn, where the gain is zero
+    return largest / np.maximum(largest, damping * gain)

@@ -36,8 +36,9 @@ _DELAYS = [TIME_STEP * count for count in range(round(MAX_DELAY / TIME_STEP) + 1
 class Margin(NamedTuple):
     """Where the loops of a robot lose their stability."""
 
-    delay: float  # [s] the largest that they bear, in whole milliseconds; at most MAX_DELAY
-    frequency: float | None  # [Hz] of the mode that grows with a millisecond more
+    # [s] the largest that they bear, in whole milliseconds, at most MAX_DELAY; None: not even zero
+    delay: float | None
+    frequency: float | None  # [Hz] of the mode that grows with a millisecond more; None: none does
 
 
 class Loops(NamedTuple):
@@ -52,11 +53,20 @@ class Loops(NamedTuple):
     slowest: float  # [Hz] of the modes that count
 
 
-def loops(robot: Robot, config: WalkConfig, weights: Weights) -> Loops:
-    """Return the loops of a robot with a controller in the middle of a step."""
+def step_response(robot: Robot, config: WalkConfig) -> Response:
+    """Return the mechanics of a robot in the middle of a step of its gait, on the fewest feet."""
     cycle = jnp.arange(config.gait.cycle)
     contact = min(np.asarray(gait.contact(config.gait, cycle)), key=np.sum)
-    answer = response(robot, np.flatnonzero(contact).tolist())
+    return response(robot, np.flatnonzero(contact).tolist())
+
+
+def loops(robot: Robot, config: WalkConfig, weights: Weights, answer: Response) -> Loops:
+    """Return the loops of a robot with a controller.
+
+    Args:
+        robot, config, weights: what walks.
+        answer: of the robot in the middle of a step, `step_response`.
+    """
     N, size = answer.motions, answer.motions.shape[1]
     free = N.T @ answer.mobility  # accelerations z'' by generalised forces, as N is orthonormal
     damped = -float(hfs(robot.description).joint_damping) * free[:, 6:] @ N[6:]
@@ -174,22 +184,28 @@ def modes(parts: Loops, delay: float, lag: float = LAG) -> Complex[np.ndarray, "
     return rates[np.argsort(-rates.real)]
 
 
-def delay_margin(robot: Robot, config: WalkConfig, weights: Weights) -> Margin:
+def delay_margin(parts: Loops) -> Margin:
     """Return the largest delay with which the loops are stable, with the lag of slow motors."""
-    parts = loops(robot, config, weights)
-    for count, delay in enumerate(_DELAYS):
+    bears = None
+    for delay in _DELAYS:
         growing = [mode for mode in modes(parts, delay) if mode.real > 0.0]
         if growing:
-            return Margin(_DELAYS[max(count - 1, 0)], float(growing[0].imag) / (2 * np.pi))
-    return Margin(MAX_DELAY, None)
+            return Margin(bears, float(growing[0].imag) / (2 * np.pi))
+        bears = delay
+    return Margin(bears, None)
 
 
-def softened(robot: Robot, config: WalkConfig, weights: Weights) -> WalkConfig | None:
+def softened(
+    robot: Robot, config: WalkConfig, weights: Weights, answer: Response
+) -> WalkConfig | None:
     """Return a controller whose loops are stable with MAX_DELAY; None if none was found.
 
     It plans with the inertia of `planned_inertia`, and its legs have no more than the gains needed.
+
+    Args:
+        robot, config, weights, answer: as for `loops`.
     """
-    answer, Q = response(robot), weights.Q
+    Q = weights.Q
     shares = planned_inertia(
         trunk_gain(robot, answer),
         angle=float(np.max(Q.euler)),
@@ -203,7 +219,7 @@ def softened(robot: Robot, config: WalkConfig, weights: Weights) -> WalkConfig |
         kd = tuple(_short(share * gain) for gain in config.legs.kd)
         mpc, legs = replace(config.mpc, inertia=inertia), replace(config.legs, kp=kp, kd=kd)
         softer = replace(config, mpc=mpc, legs=legs)
-        if np.all(modes(loops(robot, softer, weights), MAX_DELAY).real <= 0.0):
+        if np.all(modes(loops(robot, softer, weights, answer), MAX_DELAY).real <= 0.0):
             return softer
     return None
 
@@ -214,12 +230,17 @@ def _short(x: float) -> float:
 
 def delay_lines(robot: Robot, config: WalkConfig, weights: Weights) -> list[str]:
     """Return the lines about the delay of the motors that the loops bear, and how to bear more."""
-    bears, frequency = delay_margin(robot, config, weights)
+    answer = step_response(robot, config)
+    bears, frequency = delay_margin(loops(robot, config, weights, answer))
     motors = f"of the motors, with a lag of {1e3 * LAG:g} ms"
-    if frequency is None:
-        return [f"stable up to {1e3 * bears:g} ms {motors}"]
-    lines = [f"stable up to {1e3 * bears:g} ms {motors}; later, it shakes at {frequency:.0f} Hz"]
-    softer = softened(robot, config, weights)
+    stable = f"not stable with any delay {motors}: it shakes"
+    if bears is not None:
+        stable = f"stable up to {1e3 * bears:g} ms {motors}"
+        if frequency is None:
+            return [stable]
+        stable += "; later, it shakes"
+    lines = [f"{stable} at {frequency:.0f} Hz"]
+    softer = softened(robot, config, weights, answer)
     if softer is None:
         return [*lines, "lower mpc.inertia, legs.kp and legs.kd, or take motors that are faster"]
     keys = (("mpc", "inertia"), ("legs", "kp"), ("legs", "kd"))

@@ -33,20 +33,15 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
-from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
-from hector_jax.core.settings import read_toml
+from hector_jax.core.settings import from_table, read_toml
 from hector_jax.core.trajectory import FEET
-from hector_jax.robot.checks import standing_data
-from hector_jax.robot.description import MAX_BYTES, Description, description_of
+from hector_jax.robot.description import MAX_BYTES, Description, Joints, description_of
 from hector_jax.robot.importer.soles import Sole, find_soles
 from hector_jax.robot.importer.stand import standing_pose
 from hector_jax.robot.importer.survey import Survey, survey_file
-from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.model import Robot, build_model, quiet_mujoco, robot_of
 from hector_jax.robot.response import (
     Response,
@@ -76,15 +71,6 @@ class Proposal(NamedTuple):
     error: str | None = None  # why the robot cannot be used
 
 
-class Size(NamedTuple):
-    """The inputs of the rules."""
-
-    mass: float  # relative to HECTOR's
-    height: float  # relative to HECTOR's
-    robot: Robot
-    inertia: Float[np.ndarray, " joints"]  # at each joint, standing [kg m^2]
-
-
 @quiet_mujoco()
 def propose(path: Path) -> Proposal:
     """Return the proposed TOML of a model's file, or of a TOML file with what it leaves out.
@@ -98,25 +84,23 @@ def propose(path: Path) -> Proposal:
         own = read_toml(path, "the robot description", MAX_BYTES)
         if not isinstance(own.get("model"), str):
             description_of(path, own)  # refuses it
-    joints, wrong, error = own.get("joints"), [], None
-    joints = joints if isinstance(joints, dict) else {}
-    named = [list(map(str, joints[leg])) for leg in sum(FEET.values(), ()) if leg in joints]
+    wrong, error = [], None
     stem = "".join(x if x.isalnum() or x in "-_" else "-" for x in path.stem)
     found = Proposal({"name": stem, **own}, (), [])
     try:
+        named = _named_legs(path, own)
         if not (named and "feet" in own and "standing" in own):
             found = _with_legs(survey_file(path.with_name(own["model"]), named), found)
             found = _with_feet(found, wrong)
         names = {key: found.table[key] for key in _NAMES if key in found.table}
         description = description_of(path.with_suffix(".toml"), names)
-        robot = robot_of(description, checked=False)
-        if armature := _armature(description, robot):
+        if armature := _armature(description):
             names["joints"] = _merged({"armature": armature}, names["joints"])
             description = description_of(description.path, names)
-            robot = robot_of(description, checked=False)
-        table = _merged(_settings(size_of(description, robot)), found.table | names)
+        robot = robot_of(description, checked=False)
+        table = _merged(_settings(robot), found.table | names)
         description = description_of(description.path, table)
-        found = found._replace(table=table, robot=robot_of(description, checked=False))
+        found = found._replace(table=table, robot=robot._replace(description=description))
         robot_of(description)
     except InputError as raised:
         error = str(raised)
@@ -140,6 +124,14 @@ def standard_form(proposal: Proposal, model: str) -> tuple[dict[str, Any], str]:
     }
     named = {"standing": description.standing_key, "joints": joints, "feet": feet}
     return table | {"model": model} | named, build_model(description)[0].to_xml()
+
+
+def _named_legs(path: Path, own: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Return the joints of each leg that a TOML file names; none if they are to be found."""
+    joints = own.get("joints", {})
+    if isinstance(joints, dict) and not {*joints} & {*sum(FEET.values(), ())}:
+        return []
+    return list(from_table(f"{path}: joints", Joints, joints).legs.values())
 
 
 def _with_legs(survey: Survey, found: Proposal) -> Proposal:
@@ -196,24 +188,17 @@ def _left_out(table: dict[str, Any], own: dict[str, Any], prefix: str = "") -> l
     return keys
 
 
-def size_of(description: Description, robot: Robot) -> Size:
-    """Return the inputs of the rules for a robot."""
-    _, model = build_model(description, checked=False)
-    M = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, standing_data(description, model), M)
-    mass, height = float(robot.mass), float(robot.standing_height)
-    return Size(mass / MASS, height / HEIGHT, robot, M.diagonal()[6:])
-
-
-def _settings(size: Size) -> dict[str, Any]:
+def _settings(robot: Robot) -> dict[str, Any]:
     """Return the part of the TOML with the settings that follow from the rules."""
-    robot, mass, root = size.robot, size.mass, math.sqrt(size.height)
     height, weight = float(robot.standing_height), float(robot.mass * robot.gravity[2])
-    ticks, torque = round(20 * root), _short(mass * size.height)
-    foot_y = foot_poses(robot, jnp.asarray(robot.standing_joints)).position[:, 1]
-    four = len(foot_y) == 4
-    flat = robot.structure.contact == "flat"
+    mass, size = float(robot.mass) / MASS, height / HEIGHT  # relative to HECTOR's
+    root, torque = math.sqrt(size), _short(mass * size)
+    ticks = round(20 * root)
+    four, flat = len(robot.foot_point) == 4, robot.structure.contact == "flat"
     step_ticks, answer = max(3, math.ceil(0.15 * ticks)), response(robot)
+    step, gain = _TICK * step_ticks, trunk_gain(robot, answer)
+    inertia = planned_inertia(gain, angle=_ANGLE, rate=_RATE, step=step, tick=_TICK)
+    aside = float(np.abs(answer.lever[:, 1]).mean())
     return {
         "limits": {"min_height": round(0.55 * height, 2)},
         "gait": ({"pattern": "trot"} if four else {}) | {"stance": ticks, "swing": ticks},
@@ -222,19 +207,19 @@ def _settings(size: Size) -> dict[str, Any]:
             "max_force": float(f"{2.5 * weight:.2g}"),
             "effort_reference": "gravity",
             **({"sole_width": 0.6} if flat else {}),
-            "inertia": _inertia(robot, answer, _TICK * step_ticks),
+            "inertia": inertia.round(2).tolist(),
         },
         "footstep": {
-            "width": round((0.7 if four else 0.85) * float(np.abs(foot_y).mean()), 3),
+            "width": round((0.7 if four else 0.85) * aside, 3),
             "feedback": round(0.12 * root, 3),
         },
         "legs": {
             "height": round(0.06 * height / 0.69, 3),
             "landing": -0.005,
-            **_gains(size, answer),
+            **_gains(robot, answer),
             "gravity_compensation": True,
         },
-        "weights": _weights(size),
+        "weights": _weights(mass, size),
         "loss": {"L_ctrl": _short(mass**-2)},
         "tuning": {
             "lead": 2 * ticks,
@@ -247,40 +232,34 @@ def _settings(size: Size) -> dict[str, Any]:
             "joint_friction": torque,
             "joint_damping": torque,
             "push": _short(mass),
-            "trunk_com": _short(size.height),
+            "trunk_com": _short(size),
             "payload": _short(mass),
         },
     }
 
 
-def _armature(description: Description, robot: Robot) -> list[float] | None:
+def _armature(description: Description) -> list[float] | None:
     """Return the armature of a leg's motors [kg m^2] by the rule, None if the file has all."""
+    _, model = build_model(description, checked=False)
     count = description.leg_joints
-    armature = build_model(description, checked=False)[1].dof_armature[6 : 6 + count]
-    default = _ARMATURE_PER_LIMIT * robot.torque_limit[:count]
+    armature = model.dof_armature[6 : 6 + count]
+    default = _ARMATURE_PER_LIMIT * model.actuator_ctrlrange[:count, 1]
     complete = np.all(armature)
     return None if complete else [_short(x) for x in np.where(armature, armature, default)]
 
 
-def _inertia(robot: Robot, answer: Response, step: float) -> list[float]:
-    """Return the shares of the inertia with which an MPC of a step [s] plans."""
-    gain = trunk_gain(robot, answer)
-    shares = planned_inertia(gain, angle=_ANGLE, rate=_RATE, step=step, tick=_TICK)
-    return [round(float(share), 2) for share in shares]
-
-
-def _gains(size: Size, answer: Response) -> dict[str, list[float]]:
+def _gains(robot: Robot, answer: Response) -> dict[str, list[float]]:
     """Return the gains of a leg's joints from the mean inertia and least torque of all legs."""
-    legs = len(size.robot.foot_point)
-    inertia = size.inertia.reshape(legs, -1).mean(axis=0)
-    limit = size.robot.torque_limit.reshape(legs, -1).min(axis=0)
+    legs = len(robot.foot_point)
+    inertia = answer.inertia.reshape(legs, -1).mean(axis=0)
+    limit = robot.torque_limit.reshape(legs, -1).min(axis=0)
     kp = np.minimum(inertia * swing_frequency(answer) ** 2, _KP_PER_LIMIT * limit)
     return {"kp": [_short(x) for x in kp], "kd": [_short(x) for x in np.sqrt(kp * inertia)]}
 
 
-def _weights(size: Size) -> dict[str, Any]:
-    """Return HECTOR's Q, and R scaled by the squares of mass and of mass times height."""
-    force, moment = size.mass**-2, (size.mass * size.height) ** -2
+def _weights(mass: float, size: float) -> dict[str, Any]:
+    """Return HECTOR's Q, and R scaled by the squares of mass and of mass times size."""
+    force, moment = mass**-2, (mass * size) ** -2
     rates = {"ang_velocity": _RATE, "velocity": 1}
     return {
         "nominal": {

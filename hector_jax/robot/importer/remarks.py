@@ -22,10 +22,11 @@ Sides = tuple[Float[np.ndarray, "j n"], Float[np.ndarray, "j n"]]
 
 def remarks(robot: Robot) -> list[str]:
     """Return one line per likely cause of trouble in walking, with its remedy."""
-    description, model = robot.description, build_model(robot.description, checked=False)[1]
+    description, source = robot.description, build_spec(robot.description)
+    model = source.spec.compile()
     share, weight = float(robot.link_mass.sum() / robot.mass), float(robot.mass * robot.gravity[2])
     control = {name: dict(section) for name, section in description.control}
-    lines = [*_units(robot), *_differences(robot, model), *_overlaps(build_spec(description))]
+    lines = [*_units(robot), *differences(robot), *_overlaps(source, model)]
     if share > _HEAVY_LEGS and not control.get("legs", {}).get("gravity_compensation"):
         lines.append(
             f"the legs are {100 * share:.0f} % of the mass and lift the trunk when they stretch: "
@@ -75,19 +76,21 @@ def _units(robot: Robot) -> Iterator[str]:
         yield f"{mass:.3g} kg with a centre of mass {height:.3g} m high is no robot: write kg and m"
 
 
-def _differences(robot: Robot, model: mujoco.MjModel) -> Iterator[str]:
-    """Yield one line for each two joints at which the legs differ."""
-    for left, right, has in pairs_of(robot, model):
+def differences(robot: Robot) -> list[str]:
+    """Return one line for each two joints at which the legs of a pair are no mirror images."""
+    lines = []
+    for left, right, has in pairs_of(robot, build_model(robot.description, checked=False)[1]):
         for i, names in enumerate(zip(left, right, strict=True)):
             unlike = [x for x in has if x != "standing [rad]" and _unlike(has[x])[i]]
             if unlike:
                 found = (f"{x} {words_of(has[x], i, numbers, ' and ')}" for x in unlike)
-                yield f"{' and '.join(names)} are no mirror images: {'; '.join(found)}"
+                lines.append(f"{' and '.join(names)} are no mirror images: {'; '.join(found)}")
+    return lines
 
 
-def _overlaps(source: Source) -> Iterator[str]:
+def _overlaps(source: Source, model: mujoco.MjModel) -> Iterator[str]:
     """Yield one line for each two links that touch, standing, and do not in the file."""
-    data = mujoco.MjData(source.spec.compile())
+    data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(data.model, data, 0)
     now = _touching(data, {data.model.body(link.name).id: link.name for link in source.links})
     then = _touching(source.file, {b: link.name for link in source.links for b in link.bodies})

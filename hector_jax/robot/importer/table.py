@@ -4,7 +4,6 @@ import textwrap
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.robot.checks import standing_data, trunk_body
@@ -14,7 +13,14 @@ from hector_jax.robot.importer.survey import axis_words
 from hector_jax.robot.kinematics import knee_joints
 from hector_jax.robot.model import Robot, build_model
 
-_HEADER = ("joint", "axis", "range [rad]", "motor [N m]", "link [kg]", "standing [rad]")
+_COLUMNS = {
+    "axis": axis_words,
+    "range [rad]": range_words,
+    "motor [N m]": numbers,
+    "link [kg]": numbers,
+    "standing [rad]": lambda angle: f"{angle[0]:+.2f}",
+}
+_WIDTH = 91  # of the names of a line
 
 
 def table_of(robot: Robot) -> list[str]:
@@ -23,21 +29,20 @@ def table_of(robot: Robot) -> list[str]:
     count = description.leg_joints
     share = float(robot.link_mass.sum() / robot.mass)
     trunk = model.body(trunk_body(model)).name
-    columns = {name: numbers for name in _HEADER[3:5]}
-    columns = {"axis": axis_words, "range [rad]": range_words, **columns, "standing [rad]": _signed}
     rows = [
-        (f"{left[i]}, {right[i]}", *(words_of(has[x], i, write) for x, write in columns.items()))
+        (f"{left[i]}, {right[i]}", *(words_of(has[x], i, write) for x, write in _COLUMNS.items()))
         for left, right, has in pairs_of(robot, model)
         for i in range(count)
     ]
+    fixed = ", ".join(description.weld) or "no joint"
     return [
         f"robot    {description.name}: {robot.mass:.4g} kg, trunk {trunk!r}; standing, its centre "
         f"of mass is {robot.standing_height:.3g} m high",
         f"legs     {count} joints each, {100 * share:.0f} % of the mass; "
         f"{_knees(_knees_ahead(robot, model))}",
-        *_columns([_HEADER, *rows]),
+        *_columns([("joint", *_COLUMNS), *rows]),
         f"feet     {robot.structure.contact}: {_sole(robot)}",
-        *_list("fixed", description.weld),
+        *section("fixed", textwrap.wrap(fixed, _WIDTH, break_on_hyphens=False)),
     ]
 
 
@@ -57,10 +62,6 @@ def _knees_ahead(robot: Robot, model: mujoco.MjModel) -> list[bool]:
     return (z * u > x * w)[::2].tolist()
 
 
-def _signed(value: Float[np.ndarray, "1"]) -> str:
-    return f"{value[0]:+.2f}"
-
-
 def _sole(robot: Robot) -> str:
     if robot.structure.contact == "point":
         return "one contact each"
@@ -77,10 +78,9 @@ def _knees(forwards: Sequence[bool]) -> str:
     return f"knees bend {direction}; numbers of left legs, and of right ones where they differ:"
 
 
-def _list(title: str, names: Sequence[str]) -> list[str]:
-    """Return the names, wrapped into lines, after a title."""
-    lines = textwrap.wrap(", ".join(names) or "no joint", 91, break_on_hyphens=False)
-    return [f"{title if i == 0 else '':8s} {line}" for i, line in enumerate(lines)]
+def section(title: str, lines: Sequence[str]) -> list[str]:
+    """Return lines, or "nothing", beside a title."""
+    return [f"{'' if i else title:8s} {line}" for i, line in enumerate(lines or ["nothing"])]
 
 
 def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
