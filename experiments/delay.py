@@ -52,7 +52,7 @@ def _gains(config: WalkConfig, kp: float = 1.0, kd: float = 1.0) -> WalkConfig:
 
 def _whole(config: WalkConfig) -> WalkConfig:
     """Plan with the inertia of the whole robot."""
-    return replace(config, mpc=replace(config.mpc, inertia=(1.0, 1.0, 1.0)))
+    return replace(config, mpc=replace(config.mpc, inertia_share=(1.0, 1.0, 1.0)))
 
 
 def _before(robot: Robot, config: WalkConfig) -> WalkConfig:

@@ -448,7 +448,7 @@ def test_the_standard_form_is_read_as_it_is_and_is_the_same_robot(monkeypatch, t
     proposal = propose(model)
     own, robot = proposal.robot, load_robot(out)
     again = propose(tmp_path / "new-standard.xml").table
-    for section, key in (("mpc", "inertia"), ("legs", "kp"), ("legs", "kd")):
+    for section, key in (("mpc", "inertia_share"), ("legs", "kp"), ("legs", "kd")):
         np.testing.assert_allclose(again[section][key], proposal.table[section][key], rtol=0.02)
     assert robot.structure == own.structure
     assert robot.structure.contact == kind

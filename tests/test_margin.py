@@ -121,14 +121,14 @@ def test_the_plan_keeps_the_phase_margin_with_its_share_of_the_inertia():
 
 
 def test_the_plan_turns_its_share_of_the_inertia():
-    config = MpcConfig(inertia=(0.25, 1.0, 0.49))
+    config = MpcConfig(inertia_share=(0.25, 1.0, 0.49))
     found = config.planned_inertia(np.ones((3, 3)))
     np.testing.assert_allclose(found[0], [0.25, 0.5, 0.35])
     assert config.planned_inertia(np.ones((3, 3), np.float32)).dtype == np.float32
-    with pytest.raises(InputError, match=r"MpcConfig.inertia must be .* above 0 and at most 1"):
-        MpcConfig(inertia=(0.0, 1.0, 1.0))
-    with pytest.raises(InputError, match="MpcConfig.inertia must be 3 numbers"):
-        MpcConfig(inertia=(1.0,))
+    with pytest.raises(InputError, match=r"MpcConfig.inertia_share must .* above 0 and at most 1"):
+        MpcConfig(inertia_share=(0.0, 1.0, 1.0))
+    with pytest.raises(InputError, match="MpcConfig.inertia_share must be 3 numbers"):
+        MpcConfig(inertia_share=(1.0,))
 
 
 def test_the_gain_of_the_plan_is_the_derivative_of_the_mpc():
@@ -195,13 +195,13 @@ def test_the_rules_of_the_gains_bear_the_delay_that_made_the_legs_cycle():
     assert remedy.startswith("for 8 ms set legs.kp = [")
     # w = 30 rad/s and the inertia of the whole robot, as robots were proposed before
     legs = replace(config.legs, kp=(45.8, 37.4, 13.2), kd=(1.53, 1.25, 0.439))
-    stiff = replace(config, legs=legs, mpc=replace(config.mpc, inertia=(1.0, 1.0, 1.0)))
+    stiff = replace(config, legs=legs, mpc=replace(config.mpc, inertia_share=(1.0, 1.0, 1.0)))
     found = delay_margin(loops_of(QUADRUPED, stiff))
     assert found.delay == pytest.approx(0.003)
     assert found.frequency == pytest.approx(21.0, abs=2.0)  # in MuJoCo the cycle has 20 Hz
     first, remedy = delay_lines(QUADRUPED, stiff, weights)
     assert first.startswith("stable up to 3 ms of the motors, with a lag of 6 ms; later, it shakes")
-    assert remedy.startswith("for 8 ms set mpc.inertia = [0.59, 1.0, 1.0], legs.kp = [")
+    assert remedy.startswith("for 8 ms set mpc.inertia_share = [0.59, 1.0, 1.0], legs.kp = [")
 
 
 def test_a_robot_that_stands_has_no_swing_leg_to_shake():

@@ -1,6 +1,7 @@
 """The function of each command of `hector`; its flags are in flags.py."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from functools import partial, singledispatch
 from pathlib import Path
@@ -151,6 +152,9 @@ def examine_robot(args: flags.Robot) -> None:
             raise InputError(f"--out must be a new file, and {out} exists")
     proposal = propose_robot(file)
     robot, lines, told, wrong = proposal.robot, [], [], list(proposal.wrong)
+    if file.suffix == ".toml":
+        with suppress(InputError):  # it does not say enough to walk: what the rules make of it
+            robot = load_robot(file)
     if robot is not None:
         lines, told = table_of(robot), remarks(robot)
         if proposal.error is None:

@@ -71,7 +71,7 @@ class MpcConfig:
     # share of a flat sole's half width that the plan uses
     sole_width: Annotated[float, SHARE] = 1.0
     # shares of the robot's inertia about the trunk's x, y and z with which the plan turns it
-    inertia: tuple[float, ...] = (1.0, 1.0, 1.0)
+    inertia_share: tuple[float, ...] = (1.0, 1.0, 1.0)
     line_friction: bool = True  # False removes LINE_FRICTION from the constraints
     effort_reference: str = "zero"  # cost on u (paper); "gravity": on u minus the weight's share
     position_limit: float | None = None  # [m] largest horizontal error that counts; None: any
@@ -86,9 +86,10 @@ class MpcConfig:
 
     def __post_init__(self) -> None:
         share, words = Range(0.0, 1.0, above=True), ("zero", "gravity")
-        check(self, position_limit=POSITIVE, effort_reference=words, inertia=share)
-        if len(self.inertia) != 3:
-            raise InputError(f"MpcConfig.inertia must be 3 numbers, got {short_repr(self.inertia)}")
+        check(self, position_limit=POSITIVE, effort_reference=words, inertia_share=share)
+        if len(self.inertia_share) != 3:
+            got = short_repr(self.inertia_share)
+            raise InputError(f"MpcConfig.inertia_share must be 3 numbers, got {got}")
         model = choose_part("MpcConfig.contact", self.contact, ContactModel, CONTACT_MODELS)
         chosen = [
             choose_part("MpcConfig.constraints", constraint, Constraint, CONSTRAINTS)
@@ -116,9 +117,9 @@ class MpcConfig:
         self, inertia: Float[Array | np.ndarray, "3 3"]
     ) -> Float[Array | np.ndarray, "3 3"]:
         """Return the inertia [kg m^2] that the plan turns, from that of the whole robot."""
-        if self.inertia == (1.0, 1.0, 1.0):
+        if self.inertia_share == (1.0, 1.0, 1.0):
             return inertia
-        root = np.sqrt(self.inertia)
+        root = np.sqrt(self.inertia_share)
         return inertia * np.outer(root, root).astype(inertia.dtype)
 
     @property

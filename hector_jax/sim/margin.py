@@ -213,11 +213,11 @@ def softened(
         step=config.mpc_step,
         tick=config.gait.tick,
     )
-    inertia = tuple(np.minimum(config.mpc.inertia, shares.round(2)).tolist())
+    inertia = tuple(np.minimum(config.mpc.inertia_share, shares.round(2)).tolist())
     for share in (1.0, 0.8, 0.6, 0.4):
         kp = tuple(_short(share**2 * gain) for gain in config.legs.kp)
         kd = tuple(_short(share * gain) for gain in config.legs.kd)
-        mpc, legs = replace(config.mpc, inertia=inertia), replace(config.legs, kp=kp, kd=kd)
+        mpc, legs = replace(config.mpc, inertia_share=inertia), replace(config.legs, kp=kp, kd=kd)
         softer = replace(config, mpc=mpc, legs=legs)
         if np.all(modes(loops(robot, softer, weights, answer), MAX_DELAY).real <= 0.0):
             return softer
@@ -242,8 +242,8 @@ def delay_lines(robot: Robot, config: WalkConfig, weights: Weights) -> list[str]
     lines = [f"{stable} at {frequency:.0f} Hz"]
     softer = softened(robot, config, weights, answer)
     if softer is None:
-        return [*lines, "lower mpc.inertia, legs.kp and legs.kd, or take motors that are faster"]
-    keys = (("mpc", "inertia"), ("legs", "kp"), ("legs", "kd"))
+        return [*lines, "lower mpc.inertia_share, legs.kp and legs.kd, or take faster motors"]
+    keys = (("mpc", "inertia_share"), ("legs", "kp"), ("legs", "kd"))
     numbers = {f"{x}.{y}": [getattr(getattr(c, x), y) for c in (config, softer)] for x, y in keys}
     changed = (f"{key} = {list(new)}" for key, (old, new) in numbers.items() if old != new)
     return [*lines, f"for {1e3 * MAX_DELAY:g} ms set {', '.join(changed)}"]

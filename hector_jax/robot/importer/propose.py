@@ -17,7 +17,7 @@ of mass m and height h:
                              with which slow motors leave the joints a phase margin of 20 degrees
                              (`response`); at most 2 / rad times the torque limit
     kd                       sqrt(kp I)
-    mpc.inertia              that share which leaves the plan's attitude the same phase margin
+    inertia_share            that share which leaves the plan's attitude the same phase margin
     Q                        HECTOR's
     R of forces, moments     times (m0 / m)^2, (m0 h0 / (m h))^2; for nominal times 0.3 as well
     L_ctrl                   times (m0 / m)^2
@@ -207,7 +207,7 @@ def _settings(robot: Robot) -> dict[str, Any]:
             "max_force": float(f"{2.5 * weight:.2g}"),
             "effort_reference": "gravity",
             **({"sole_width": 0.6} if flat else {}),
-            "inertia": inertia.round(2).tolist(),
+            "inertia_share": inertia.round(2).tolist(),
         },
         "footstep": {
             "width": round((0.7 if four else 0.85) * aside, 3),
