@@ -22,7 +22,7 @@ from hector_jax.control.weights import Weights
 from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning, descend
-from hector_jax.tuning.evaluate import Evaluation, Objective, mean_of
+from hector_jax.tuning.evaluate import Evaluation, mean_objective
 from hector_jax.tuning.grounded import measured_states
 
 _measured_states = jax.jit(measured_states)
@@ -92,9 +92,9 @@ def tune_measured(
     """
     matrices = []  # of the walks evaluated last, which `descend` asks for: a walk is dear
 
-    def mean(weights: Weights) -> Evaluation:
-        evaluations, matrices[:] = zip(*evaluate(weights), strict=True)
-        return mean_of(evaluations, np.ones(len(evaluations)))
+    def evaluations(weights: Weights) -> list[Evaluation]:
+        found, matrices[:] = zip(*evaluate(weights), strict=True)
+        return list(found)
 
-    objective = Objective(mean, lambda weights: np.mean(matrices, axis=0))
+    objective = mean_objective(evaluations, lambda weights: matrices)
     return descend(config, weights, objective, on_iteration)

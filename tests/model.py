@@ -15,6 +15,7 @@ from hector_jax.grfm.residual import init, with_statistics
 from hector_jax.robot.description import TuningSettings
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.evaluate import mean_objective
 from hector_jax.tuning.rollout import RolloutConfig
 
 ROBOT = load_robot()
@@ -46,3 +47,12 @@ def small_net(seed=0):
 def small_effect(seed=0):
     """Phi of `small_net`."""
     return as_effect(small_net(seed))
+
+
+def mean_of(objectives, losses=None):
+    """The mean of objectives, see `mean_objective`."""
+    return mean_objective(
+        lambda weights: [objective.evaluate(weights) for objective in objectives],
+        lambda weights: [objective.matrix(weights) for objective in objectives],
+        losses,
+    )

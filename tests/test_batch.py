@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from lib import sample_weights
+from model import mean_of
 
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import (
@@ -35,7 +36,7 @@ from hector_jax.tuning.batch import (
     tune_batch,
 )
 from hector_jax.tuning.difftune import TuneConfig, tune
-from hector_jax.tuning.evaluate import Evaluation, Objective, mean_objective
+from hector_jax.tuning.evaluate import Evaluation, Objective
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
 from hector_jax.tuning.parallel_rollout import parallel_rollout
 from hector_jax.tuning.rollout import RolloutConfig, no_variation, rollout
@@ -211,7 +212,7 @@ def test_the_mean_of_scenarios_is_tuned_by_the_mean_of_their_matrices(on_toy):
 
         return Objective(evaluate, lambda weights: objective.matrix(weights) / k)
 
-    mean = mean_objective([divided(o, k) for o, k in zip(each, scales, strict=True)])
+    mean = mean_of([divided(o, k) for o, k in zip(each, scales, strict=True)])
     alone = difftune.descend(config, STARTS[2], mean)
     ours = jax.tree.map(lambda x: x[0], found)
     close(ours.weights, alone.weights, rtol=1e-9)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.interpreters.partial_eval import dce_jaxpr
-from model import ANCHOR, PLAIN, ROBOT
+from model import ANCHOR, PLAIN, ROBOT, mean_of
 
 from hector_jax.control.parameters import step_names, stepped
 from hector_jax.control.reference import named_command
@@ -21,7 +21,6 @@ from hector_jax.tuning.difftune import (
     trial_weights,
     update,
 )
-from hector_jax.tuning.evaluate import mean_objective
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
@@ -70,7 +69,7 @@ def point(objective):
 def test_the_gradient_by_steps_is_that_of_differences_and_of_the_forward_mode(objectives):
     """Of the mean of two commands, with tied feet and other numbers, noise and a delay."""
     scales = np.array([2.0, 0.5])
-    found = point(mean_objective(objectives, scales / scales.mean()))
+    found = point(mean_of(objectives, scales / scales.mean()))
     shares = scales.mean() / scales / 2.0
     size = np.linalg.norm(found.gradient)
     random = np.linalg.qr(np.random.default_rng(0).normal(size=(22, 22)))[0]

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from model import mean_of
 
 from hector_jax.cli.flags import Tunables
 from hector_jax.control.controller import WalkConfig
@@ -43,7 +44,7 @@ from hector_jax.tuning.difftune import (
     tune,
     update,
 )
-from hector_jax.tuning.evaluate import Evaluation, Objective, aligned, mean_objective
+from hector_jax.tuning.evaluate import Evaluation, Objective, aligned
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig
 from hector_jax.tuning.status import StepStatus, Stop, status_text
@@ -417,14 +418,14 @@ def test_the_mean_of_objectives_begins_at_the_mean_of_their_losses_with_equal_pa
         )
         for k in losses
     ]
-    mean = mean_objective(each, losses)
+    mean = mean_of(each, losses)
     found = mean.evaluate(nominal())
     assert found.loss == pytest.approx(4.0)
     assert found.fallen == 0.8  # the worst
     parts = [vector(random_tree(0)) * 4.0 / loss for loss in losses]
     np.testing.assert_allclose(vector(found.gradient), np.mean(parts, axis=0))
     np.testing.assert_allclose(mean.matrix(nominal()), 4.0 * np.eye(2))
-    plain = mean_objective(each)
+    plain = mean_of(each)
     np.testing.assert_allclose(plain.matrix(nominal()), losses.mean() * np.eye(2))
     np.testing.assert_allclose(
         vector(plain.evaluate(nominal()).gradient), vector(random_tree(0)), rtol=1e-12

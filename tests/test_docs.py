@@ -14,11 +14,9 @@ from dataclasses import fields
 from pathlib import Path
 from unittest import mock
 
-import jax
 import numpy as np
 import pytest
 from delay import AS_PROPOSED, BEFORE
-from model import BEST_OTHERS
 from table import PROGRAM, SETS
 from table import Flags as Table
 
@@ -27,8 +25,7 @@ from hector_jax.cli import flags, parse
 from hector_jax.control.controller import walk_config
 from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.reference import COMMANDS
-from hector_jax.control.weights import between, nominal
-from hector_jax.control.weights_file import best, load_weights
+from hector_jax.control.weights import nominal
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.margin import delay_lines
 
@@ -221,12 +218,6 @@ def test_tests_that_pages_name_are_there():
     assert len(named) > 40
     for file, name in sorted(named):  # `test_a_name...` stands for the tests that begin so
         assert f"\ndef {name}" in (ROOT / "tests" / file).read_text(), f"{file}::{name}"
-
-
-def test_the_best_set_is_half_way_between_the_sets_that_the_page_names():
-    without, tuned = (load_weights(DOCS / f"results/best/{n}.json") for n in ("without", "with"))
-    half_way = between(without, tuned)._replace(others=BEST_OTHERS)
-    jax.tree.map(np.testing.assert_allclose, best(), half_way)
 
 
 def changes(seeds):

@@ -3,7 +3,6 @@
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from queue import SimpleQueue
 
 import jax
 import jax.numpy as jnp
@@ -201,7 +200,7 @@ def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, m
     sizes = {"c": 1.0, "s": 1e3}
     commands = [named_command(name)._replace(duration=np.array([k])) for name, k in sizes.items()]
 
-    def tune_step(config, robot, weights, command, anchor, effect):
+    def tune_step(config, robot, weights, command, anchor, effect, variation=None):
         vector = np.asarray(weights_to_vector(weights))
         (size,) = command.duration
         logs = np.log(vector) - (1.0 if size > 1.0 else -1.0)
@@ -215,10 +214,11 @@ def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, m
 
     monkeypatch.setattr(tunings.difftune, "tune_step", tune_step)
     monkeypatch.setattr(tunings.difftune, "gauss_newton_jit", matrix)
-    told, config = SimpleQueue(), TuneConfig(iterations=12)
+    config = TuneConfig(iterations=12)
+    setup = Setup(ThreadPoolExecutor(2), config, robot)
     for others in ((), (commands[1],)):
         problem = tunings.Problem((commands[0], *others), None)
-        found = tunings._tune_job(config, robot, nominal(), problem, "with", told)
+        found = tunings._tune_on_cpu(setup, nominal(), problem, lambda iteration: None)
         first = found.iterations[0].evaluation
         each = [tune_step(None, None, nominal(), c, None, None) for c in (commands[0], *others)]
         mean = np.mean([one.loss for one in each])
@@ -242,13 +242,14 @@ def test_what_takes_the_mean_over_commands_is_in_the_key_of_a_tuning():
 
 
 def test_a_tuning_that_fails_is_told_while_others_go_on(tmp_path, monkeypatch, robot):
-    def job(config, robot, start, problem, name, heard):
-        if name == "with":
+    def tune(setup, start, problem, put):
+        if problem.commands is falls:
             raise InputError("the starting weights fall")
-        time.sleep(30.0)
+        time.sleep(20.0)
 
-    monkeypatch.setattr(tunings, "_tune_job", job)
-    problems = dict.fromkeys(("without", "with"), tunings.Problem((named_command("s"),), None))
+    monkeypatch.setattr(tunings, "_tune_on_cpu", tune)
+    falls, walks = (named_command("s"),), (named_command("c"),)
+    problems = {"without": tunings.Problem(walks, None), "with": tunings.Problem(falls, None)}
     begin, pool = time.monotonic(), ThreadPoolExecutor(2)
     with pytest.raises(InputError, match="the starting weights fall"):
         tunings.tune(Setup(pool, TuneConfig(), robot), problems, tmp_path, title="tuning")

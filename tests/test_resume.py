@@ -474,7 +474,7 @@ def line(*words):
     [
         (("--seeds", 8), "run: begun with --seeds 3, got 8"),
         (("--traj", "straight"), "run: begun with --traj c, got straight"),
-        (("--share", 0.5), "run: begun with --share 0.25, got 0.5"),
+        (("--smooth", 10), "run: begun with --smooth 2.0, got 10"),
         (("--walk-plants", 2), "run: begun with --walk-plants 1, got 2"),
         (("--start", "nominal"), "run: begun with --start expert, got nominal"),
     ],
@@ -486,7 +486,7 @@ def test_a_given_default_is_not_taken_for_the_flag_of_the_run(
     resumed = []
     monkeypatch.setattr(command, "_tune_in", lambda folder, args: resumed.append(args))
     (tmp_path / "data").mkdir()
-    own = {"seeds": 3, "share": 0.25, "walk_plants": 1, "start": "expert", "traj": ("c",)}
+    own = {"seeds": 3, "smooth": 2.0, "walk_plants": 1, "start": "expert", "traj": ("c",)}
     folder = tmp_path / "run"
     command.tune(flags.Tune(out=folder, data=tmp_path / "data", **own))
     if way == "file":

@@ -92,8 +92,9 @@ def test_processes_load_the_programs_that_one_of_them_compiled(monkeypatch, tmp_
     straight = command_of("straight")._replace(seconds=0.1)
     problems = {name: Problem((named_command(name),), None) for name in ("straight", "c")}
     with runtime.workers(2) as pool:
-        tunings.compile_programs(pool, config, robot, nominal(), straight)
-        tunings.tune(Setup(pool, config, robot), problems, tmp_path / "tunings", title="")
+        setup = Setup(pool, config, robot)
+        tunings.compile_programs(setup, nominal(), straight)
+        tunings.tune(setup, problems, tmp_path / "tunings", title="")
         weights = config.rollout.walk.with_others(nominal(), ["friction"])
         jobs = [Job(weights, command, hfs(), 0.1) for (command,), *_ in problems.values()]
         list(walk_many(pool, config.rollout.walk, robot, jobs))

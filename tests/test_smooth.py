@@ -1,41 +1,81 @@
 """Flags of a tuning that make `best` smoother or safer."""
 
 from concurrent.futures import Executor
+from dataclasses import replace
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 from model import BEST_OTHERS, CONFIG, ROBOT
 from pretend import pretend_tuning
+from synthetic import synthetic_walk
 
 from hector_jax.cli import run_folder
 from hector_jax.cli import tune as command
 from hector_jax.cli.flags import Tune
+from hector_jax.control.footstep import FootstepConfig
+from hector_jax.control.mpc import MpcConfig
+from hector_jax.control.parameters import GROUPS
 from hector_jax.control.trajectories import command_of
-from hector_jax.control.weights import expert, nominal
+from hector_jax.control.weights import nominal
+from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.runs import tunings
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Tuned
-from hector_jax.tuning.loss import alphas
+from hector_jax.tuning.loss import alphas, between_loss, control_loss, switch_loss
 
 
-def test_the_command_tunes_smoothly_and_takes_a_safe_set(monkeypatch, tmp_path):
-    tuned, seen = Tuned(pretend_tuning(3, expert()), ""), []
+def _tunings(monkeypatch, folder, flags, robot=ROBOT, config=CONFIG):
+    """Settings, start and problem of each tuning of a run with flags, by set."""
+    seen = {}
 
-    def tune(setup, *_, **__):
-        seen.append(setup.config)
-        return {"without": tuned, "with": tuned}
+    def tune(setup, problems, *, start, **_):
+        seen.update({name: (setup.config, start, problem) for name, problem in problems.items()})
+        return dict.fromkeys(problems, Tuned(pretend_tuning(3, start), ""))
 
     monkeypatch.setattr(tunings, "tune", tune)
-    flags, net = Tune(smooth=3.0, safe=0.05), SimpleNamespace(params=None)
-    setup, course = Setup(Executor(), CONFIG, ROBOT), (command_of("straight"),)
-    run = command._Run(setup, tmp_path, flags, nominal(), course, net)
-    best = command._tune_sets(run).sets["best"]
-    (config,), before = seen, alphas(CONFIG.loss)
-    assert alphas(config.loss) == {**before, "L_ctrl": 3.0 * before["L_ctrl"]}
-    assert config.rollout == CONFIG.rollout
-    assert best.others == {**BEST_OTHERS, "position_limit": np.array(0.05)}
+    setup, course = Setup(Executor(), config, robot), (command_of("straight"),)
+    run = command._Run(setup, folder, flags, nominal(), course, SimpleNamespace(params=None))
+    command._tune_sets(run)
+    return seen
+
+
+def test_best_alone_is_tuned_smoothly_on_drawn_models_with_its_own_numbers(monkeypatch, tmp_path):
+    seen = _tunings(monkeypatch, tmp_path, Tune(smooth=3.0, safe=0.05))
+    assert list(seen) == ["without", "with", "best"]
+    for name in ("without", "with"):
+        config, start, problem = seen[name]
+        assert (config, start.others, problem.draws) == (CONFIG, {}, 0)
+    config, start, problem = seen["best"]
+    assert start.others == {**BEST_OTHERS, "position_limit": 0.05}
+    before = alphas(CONFIG.loss)
+    assert alphas(config.loss) == {**before, "L_between": 3.0 * before["L_ctrl"]}
+    assert config.others == GROUPS["integral"]
+    assert (config.rollout, problem.draws) == (CONFIG.rollout, command.DRAWS)
+    jax.tree.map(np.testing.assert_array_equal, start[:2], nominal()[:2])
+
+
+def test_the_numbers_of_best_follow_robot_controller_and_start(monkeypatch, tmp_path):
+    tall = ROBOT._replace(standing_height=2 * ROBOT.standing_height)
+    seen = _tunings(monkeypatch, tmp_path / "tall", Tune(smooth=0.0), tall)
+    assert seen["best"][1].others["position_limit"] == 0.161
+    assert alphas(seen["best"][0].loss) == alphas(CONFIG.loss)  # no price, no term
+    own = {"mpc": MpcConfig(position_limit=20.0), "footstep": FootstepConfig(width=0.3)}
+    rollout = replace(CONFIG.rollout, walk=replace(CONFIG.rollout.walk, **own))
+    config = replace(CONFIG, rollout=rollout)
+    start = _tunings(monkeypatch, tmp_path / "own", Tune(), config=config)["best"][1]
+    save_weights(tmp_path / "start.json", start)
+    others = load_weights(tmp_path / "start.json").others  # in their boxes
+    assert others == {**BEST_OTHERS, "position_limit": 10.0, "footstep_width": 0.2}
+
+
+def test_changes_between_switches_are_those_of_control_without_switches():
+    walk = synthetic_walk(0, 60)
+    parts = [float(part(walk)) for part in (control_loss, switch_loss, between_loss)]
+    assert parts[2] == pytest.approx(parts[0] - parts[1])
+    assert 0.0 < parts[2] < parts[0]
 
 
 def test_a_limit_of_the_position_error_is_set_once():

@@ -25,6 +25,7 @@ from hector_jax.tuning.rollout import (
     _estimate_error,
     _moved_by,
     _within_friction,
+    drawn_variation,
     rollout,
     rollout_config,
     variation_of,
@@ -100,7 +101,30 @@ def test_a_force_through_the_true_centre_of_mass_does_not_turn_the_body():
 def test_a_foot_that_slips_keeps_its_direction_and_load():
     force = jnp.array([[30.0, -20.0, 50.0], [15.0, 8.0, 50.0]])
     found = _within_friction(Wrench(force, force), jnp.asarray(0.5)).force
-    np.testing.assert_allclose(found, [[15.0, -10.0, 50.0], [15.0, 8.0, 50.0]])
+    # twice the limit keeps half of it, 23 of 25 N nearly all: the edge is smooth
+    share = (1.0 + np.array([2.0, 23.0 / 25.0]) ** 8) ** (-1 / 8)
+    np.testing.assert_allclose(found[:, :2], share[:, None] * force[:, :2])
+    np.testing.assert_allclose(share, [0.5, 0.95], atol=1e-2)
+    np.testing.assert_array_equal(found[:, 2], force[:, 2])
+
+
+def test_drawn_variations_are_as_robots_differ():
+    config = RolloutConfig()
+    drawn = [drawn_variation(config, ROBOT, seed) for seed in range(200)]
+    for name, low, high in (
+        ("mass", 0.9, 1.1),
+        ("inertia", 0.8, 1.2),
+        ("friction", 0.48, 0.96),
+        ("delay", 0.0, 0.008),
+    ):
+        values = np.array([getattr(one, name) for one in drawn])
+        assert low <= values.min() < low + 0.1 * (high - low), name
+        assert high - 0.1 * (high - low) < values.max() <= high, name
+    com = np.abs([one.com for one in drawn]).max(axis=0)
+    np.testing.assert_allclose(com, [0.01, 0.01, 0.02], rtol=0.05)
+    assert len({int(one.seed) for one in drawn}) == 200
+    again = drawn_variation(config, ROBOT, 7)
+    jax.tree.map(np.testing.assert_array_equal, again, drawn[7])
 
 
 def test_the_error_of_the_estimate_has_its_stated_sizes():

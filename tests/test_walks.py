@@ -325,7 +325,7 @@ def test_the_sets_to_choose_from_are_the_start_each_gain_and_the_answer(pool, in
 def test_the_points_of_a_folder_stay_in_one_metric(monkeypatch, pool, in_process):
     """Where another release computes another matrix, the walks are still of their weights."""
     one, _, rows = in_process
-    monkeypatch.setattr(walks.tunings, "gauss_newton_job", None)
+    monkeypatch.setattr(walks.tunings, "gauss_newton", None)
     space = walks.space_of(pool, one)
     again = campaigns.weights_at(one, space, rows[-1].point)
     kept = load_weights(walks.weights_path(one.folder, len(rows) - 1), one.robot)
@@ -369,13 +369,13 @@ def test_a_run_spends_the_walks_that_were_asked_for(monkeypatch, robot, tmp_path
         seen["engine"] = one.engine.name
         return [row]
 
-    monkeypatch.setattr(command.tunings, "tune", lambda *_, **__: {"without": there, "with": there})
-    monkeypatch.setattr(command.choice, "choose", lambda *_, **__: {})
-    monkeypatch.setattr(command.choice, "answer", lambda *_, **__: nominal())
+    monkeypatch.setattr(
+        command.tunings, "tune", lambda _, problems, **__: dict.fromkeys(problems, there)
+    )
     monkeypatch.setattr(command, "tune_on_walks", on_walks)
     monkeypatch.setattr(command, "choose_engine", ENGINES.get)  # installed or not
     monkeypatch.setattr(command, "candidates", lambda *_: {"set 0": nominal(), "set 1": expert()})
-    monkeypatch.setattr(command.choice, "earliest", lambda *_, **__: "set 1")
+    monkeypatch.setattr(command.choice, "walks_best", lambda _, sets, *__, **___: [*sets][-1])
     net = SimpleNamespace(params="a net")
     course = NamedCommand("straight", named_command("straight"))
     setup, args = (

@@ -169,18 +169,17 @@ class Tune(Configured, Parallel):
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
     each: bool = False  # tune the trajectories one by one, each in a run folder of its own
     start: Weights = "nominal"  # where to start: nominal, expert, best or a weights file
-    # weights: Q and R; also footsteps, integral, all, legs (with --walks), or numbers by name
+    # weights: Q and R; also footsteps, integral, all, legs (with --walks), or numbers by name;
+    # `best` has the gains of the integral action in any case
     tune: tuple[Tunables, ...] = ("weights",)
     seeds: Plants = 8  # stand-in plants to evaluate on
     iterations: Iterations = 10  # largest number of steps of each tuning
     variant: Variant = "residual"  # architecture of the net
     alpha: Literal["paper", "auto"] = "paper"  # loss weights; auto makes the gradient norms alike
-    # of `with` in row `best`; the rest is `without`
-    share: Annotated[float, Range(0, 1)] = 0.5
-    # times that L_ctrl counts while tuning (not in the table): above 1, smoother commands
-    smooth: Annotated[float, Range(0.01, 100)] = 1.0
+    # price in `best` of changes of the command between switches of stance: more, smoother commands
+    smooth: Annotated[float, Range(0, 1000)] = 10.0
     # limit [m] of the position error that the MPC sees in `best`: with less it tracks worse and may
-    # fall less under pushes; default 0.19 of the robot's height, for the set between two tunings
+    # fall less under pushes; default 0.19 of the robot's height
     safe: Annotated[float | None, Range(0.001, 10)] = None
     data: Folder = Path("data")  # folder of the walks and the net, which are made if missing
     net: Annotated[Path | None, Source.FILE] = None  # file of another net, instead of that in DATA

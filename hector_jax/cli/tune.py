@@ -17,7 +17,13 @@ from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import BASELINES, Tune, Walk
 from hector_jax.cli.parse import as_command
 from hector_jax.cli.verdict import small_verdict
-from hector_jax.control.parameters import leg_numbers, model_numbers, step_names
+from hector_jax.control.parameters import (
+    GROUPS,
+    TUNABLES,
+    leg_numbers,
+    model_numbers,
+    step_names,
+)
 from hector_jax.control.reference import Command
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import Weights, expert, nominal
@@ -33,7 +39,7 @@ from hector_jax.report import fidelity, pictures
 from hector_jax.report.report import Picture, print_table
 from hector_jax.report.run import write_report
 from hector_jax.report.video import check_film
-from hector_jax.robot.model import load_robot
+from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import choice, metrics, nets, tunings, verdicts
 from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, read_object
 from hector_jax.runs.setup import Setup
@@ -45,11 +51,17 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.curvature import Determined, determined
-from hector_jax.tuning.difftune import Tuning
+from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.evaluate import aligned
 from hector_jax.tuning.loss import smoother
 
 _ARTEFACTS = "kept"  # folder in it
+DRAWS = 4  # variations of the model for each command of `best`
+LIMIT, WIDTH, FEEDBACK = 0.19, 7 / 8, 2 / 3
+"""Numbers of `best` beside its weights: limit of the position error as a share of the height of the
+centre of mass, unless --safe sets it; width and velocity feedback of the steps as shares of the
+controller's."""
+HELD_OUT = 8  # plants that compare the sets of a tuning on walks
 
 
 def tune(args: Tune) -> None:
@@ -86,11 +98,9 @@ class _Run(NamedTuple):
     net: nets.TrainedNet
 
     @property
-    def tuning(self) -> Setup:
-        """Setup of the tunings, in which L_ctrl may count more than in the table."""
-        config = self.setup.config
-        loss = smoother(config.loss, self.args.smooth)
-        return self.setup._replace(config=replace(config, loss=loss))
+    def answer(self) -> tuple[TuneConfig, Weights]:
+        """Settings and start of the tuning of `best`."""
+        return _answer(self.setup.config, self.args, self.setup.robot, self.start)
 
     @property
     def seconds(self) -> float:
@@ -120,9 +130,9 @@ class _Tuned(NamedTuple):
 
     tunings: dict[str, Tuning]
     sets: dict[str, Weights]
-    chosen: dict[str, dict[str, int]]  # iteration by set; empty if the last ones are used
+    chosen: str  # "iteration 5", the one of its tuning that is `best`
     proposals: list[Row]  # of a tuning on walks; empty without
-    best_proposal: str  # "set 3", the one that is `best`; empty without
+    best_proposal: str  # "set 3", the one that is `best` in place of it; empty without
 
 
 def _tune_in(folder: Path, args: Tune) -> None:
@@ -138,8 +148,11 @@ def _tune_in(folder: Path, args: Tune) -> None:
     with workers(args.processes) as pool:
         setup = Setup(pool, config, robot, made_with.get("commit", ""))
         inputs = setup, args.start, start, trajectories, folder / _ARTEFACTS / "hfs"
-        check, program = partial(_check_start, *inputs), (config, robot, start, trajectories[0])
-        for line in tunings.compile_programs(pool, *program, meanwhile=check):
+        check = partial(_check_start, *inputs)
+        command = trajectories[0].command
+        best = *_answer(config, args, robot, start), tunings.Problem((command,), None, 1)
+        options = {"others": [best], "meanwhile": check}
+        for line in tunings.compile_programs(setup, start, trajectories[0], **options):
             say(f"before any tuning, {trajectories[0].name} on hfs: {line}")
         net = net or nets.load_or_train(pool, robot, data, args.variant)
         run = _Run(setup, folder, args, start, trajectories, net)
@@ -170,6 +183,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         cases=len(tuned.proposals[0].losses) if tuned.proposals else 0,
         chosen=tuned.chosen,
         smooth=args.smooth,
+        draws=DRAWS,
         **_draw(run, tuned, *walks[trajectories[0].name]),
         config=settings,
         environment=made_with,
@@ -184,6 +198,28 @@ def _tune_in(folder: Path, args: Tune) -> None:
 
     print_result(args.json, {"run": str(folder), "traj": run.name, **result}, print_text)
     say(f"the report is {report}")
+
+
+def _answer(
+    config: TuneConfig, args: Tune, robot: Robot, start: Weights
+) -> tuple[TuneConfig, Weights]:
+    """Return settings and start of the tuning of `best` from those of `without` and `with`.
+
+    It tunes the gains of the integral action too, and pays for changes of the command. It begins
+    with a limit of the position error and with steps that endure pushes (docs/decisions.md).
+    """
+    others = tuple(dict.fromkeys((*config.others, *GROUPS["integral"])))
+    walk = config.rollout.walk
+    limit = args.safe or walk.mpc.position_limit or round(LIMIT * float(robot.standing_height), 3)
+    numbers = {
+        "position_limit": limit,
+        "footstep_width": round(WIDTH * walk.footstep.width, 4),
+        "footstep_feedback": round(FEEDBACK * walk.footstep.feedback, 4),
+    }
+    boxes = {name: (TUNABLES[name].lower, TUNABLES[name].upper) for name in numbers}
+    clipped = {name: float(np.clip(numbers[name], *boxes[name])) for name in numbers}
+    start = start._replace(others={**clipped, **start.others})
+    return replace(config, loss=smoother(config.loss, args.smooth), others=others), start
 
 
 def _check_start(
@@ -232,45 +268,44 @@ def _note_settings(run: _Run) -> dict[str, Any]:
 
 def _tune_sets(run: _Run) -> _Tuned:
     """Tune without and with the net; write the weights."""
-    done = tunings.tune(
-        run.tuning,
-        run.problems,
-        run.folder / _ARTEFACTS,
-        title=f"tuning {run.name} without and with GRFM-Net",
-        start=run.start,
-        metrics=run.folder / METRICS,
-    )
-    results = {name: entry.tuning for name, entry in done.items()}
     setup, commands = run.setup, list(run.commands.values())
-    options = {"seconds": run.seconds, "folder": run.folder / _ARTEFACTS / "choice"}
-    choices = choice.choose(setup, results, commands, **options)
+    config, start = run.answer
+    problem = {"best": tunings.Problem(tuple(commands), run.net.params, DRAWS)}
+    folder = run.folder / _ARTEFACTS
+    tune_in = partial(tunings.tune, folder=folder, metrics=run.folder / METRICS)
+    title = f"tuning {run.name} without and with GRFM-Net"
+    done = tune_in(setup, run.problems, title=title, start=run.start)
+    for_best = setup._replace(config=config)
+    title = f"tuning {run.name} on {plural(DRAWS * len(commands), 'drawn model')}, for `best`"
+    done |= tune_in(for_best, problem, title=title, start=start, before=done)
+    results = {name: entry.tuning for name, entry in done.items()}
+    options = {"seconds": run.seconds, "folder": folder / "choice"}
+    points, plants = choice.points_of(results["best"]), setup.robot.description.tuning.choice_plants
+    chosen = choice.walks_best(setup, points, commands, plants, **options)
     sets = {
         "nominal": nominal(setup.robot),
         "expert": expert(setup.robot),
         **({} if run.args.start in BASELINES else {"start": run.start}),
         **{name: tuning.weights for name, tuning in results.items()},
-        **{name: chosen.weights for name, chosen in choices.items()},
+        "best": points[chosen],
     }
-    compared, pair = {name: sets[name] for name in ("nominal", *results)}, ("without", "with")
-    inputs, safe = (setup, compared, pair, run.args.share, commands), run.args.safe
-    sets["best"] = choice.answer(*inputs, safe=safe, **options)
     proposals, best = [], ""
     if run.args.walks:
         sets["before_walks"] = sets.pop("best")
         campaign = _campaign(run, sets["before_walks"])
         proposals = tune_on_walks(setup.pool, campaign, run.args.walks)
         stages = candidates(setup.pool, campaign, proposals)
-        best = choice.earliest(setup, stages, commands, **options, engine=campaign.engine)
+        inputs = setup, stages, commands, HELD_OUT
+        best = choice.walks_best(*inputs, **options, engine=campaign.engine)
         sets["best"] = stages[best]
     for name, weights in sets.items():
         save_weights(run.folder / "weights" / f"{name}.json", weights)
-    chosen = {name: {"iteration": c.iteration, "of": c.of} for name, c in choices.items()}
     return _Tuned(results, sets, chosen, proposals, best)
 
 
 def _campaign(run: _Run, start: Weights) -> Campaign:
     """Return the settings of the tuning on the walks of --walks, from the result of the tunings."""
-    _, config, robot, _ = run.tuning
+    robot, config = run.setup.robot, replace(run.answer[0], others=run.setup.config.others)
     plants = choice.drawn_plants(robot, run.args.walk_plants) or [hfs(robot.description)]
     inputs = run.folder / "walks", config, robot, start, run.commands, plants
     engine = choose_engine(run.args.walk_engine)
@@ -339,8 +374,7 @@ def _result(
     if tuned.proposals:
         result["walks"] = [change._asdict() for change in changes(tuned.proposals)]
         result["best_of_walks"] = tuned.best_proposal
-    if tuned.chosen:
-        result["chosen"] = tuned.chosen
+    result["chosen"] = tuned.chosen
     directions = [direction._asdict() for direction in known.directions]
     result["determined"] = {"directions": directions, "weights": known.weights}
     write_json(run.folder / RESULT, result)
@@ -354,7 +388,7 @@ def _draw(run: _Run, tuned: _Tuned, standin: ScoredWalks, on_hfs: ScoredWalks) -
         film = background.submit(_film, run, standin)
         curves = fidelity.curves(run.setup.robot, on_hfs.first["nominal"], effects)
         inputs = tuned.sets, tuned.tunings, standin.first, curves, run.net.history
-        drawings = pictures.of_run(run.folder, run.tuning.config, *inputs)
+        drawings = pictures.of_run(run.folder, run.setup.config, *inputs)
     return {"pictures": drawings, "film": film.result()}
 
 

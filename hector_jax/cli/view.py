@@ -16,7 +16,6 @@ from hector_jax.report.video import check_film
 from hector_jax.robot.model import compile_model
 from hector_jax.runs import metrics, nets
 from hector_jax.runs.folder import read_histories, read_request, weights_of
-from hector_jax.tuning.loss import smoother
 
 
 def view_run(args: View) -> None:
@@ -64,8 +63,9 @@ def view_run(args: View) -> None:
         return titled({name: motion(robot, *viewed) for name, viewed in walks.items()}), description
 
     if folder is not None:
-        histories, loss = read_histories(args.run), smoother(request.loss, request.smooth)
-        pictures.of_view(folder, robot, histories, loss, walk()[0])
+        histories = read_histories(args.run)
+        histories.pop("best", None)  # its loss has another term
+        pictures.of_view(folder, robot, histories, request.loss, walk()[0])
         say(f"the film and the pictures are in {folder}")
         return
     on_open = lambda address: say(f"open {address} in a browser; Ctrl-C ends it")  # noqa: E731

@@ -23,6 +23,7 @@ from hector_jax.control.legs import LegConfig, LegParameters, Measurement
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, limit_distance, solve_mpc
 from hector_jax.control.parameters import TUNABLES, Parameters
 from hector_jax.control.reference import Anchor, Command, reference_at
+from hector_jax.control.slip import Grip, SlipConfig, feel, first_grip
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rotation_from_euler, wrap_angle
@@ -42,6 +43,7 @@ class WalkConfig:
     mpc: MpcConfig = MpcConfig()
     footstep: FootstepConfig = FootstepConfig()
     legs: LegConfig = LegConfig()
+    slip: SlipConfig = SlipConfig()
 
     def __post_init__(self) -> None:
         check(self)
@@ -105,10 +107,11 @@ def walk_config(robot: Robot) -> WalkConfig:
 
 
 class Memory(NamedTuple):
-    """State of the controller between ticks: last stance of each foot, and the disturbance."""
+    """State of the controller between ticks."""
 
-    liftoff: Feet
+    liftoff: Feet  # last stance of each foot
     disturbance: Disturbance
+    grip: Grip
 
 
 class Plan(NamedTuple):
@@ -249,7 +252,8 @@ def measured_feet(robot: Robot, measurement: Measurement) -> Feet:
 
 def init_memory(robot: Robot, measurement: Measurement) -> Memory:
     """Return the memory of a standing robot."""
-    return Memory(measured_feet(robot, measurement), NO_DISTURBANCE)
+    feet = measured_feet(robot, measurement)
+    return Memory(feet, NO_DISTURBANCE, first_grip(feet.position))
 
 
 def step_plan(
@@ -264,12 +268,15 @@ def step_plan(
     measurement: Measurement,
     max_contacts: int = 1,
 ) -> tuple[Memory, Plan]:
-    """Run `plan` on a measurement and remember the stance feet; call once a tick."""
+    """Run `plan` on a measurement and remember feet and grip; call once a tick."""
     feet = measured_feet(robot, measurement)
+    inputs = config.slip, config.gait, robot.standing_height, memory.grip
+    grip = feel(*inputs, feet.position, tick)
+    mpc = parameters.mpc._replace(friction=grip.share * parameters.mpc.friction)
     planned, disturbance = plan(
         config,
         robot,
-        parameters,
+        parameters._replace(mpc=mpc),
         command=command,
         anchor=anchor,
         tick=tick,
@@ -279,7 +286,7 @@ def step_plan(
         max_contacts=max_contacts,
     )
     liftoff = footstep.feet_where(planned.contact, feet, memory.liftoff)
-    return Memory(liftoff, disturbance), planned
+    return Memory(liftoff, disturbance, grip), planned
 
 
 def actuate(

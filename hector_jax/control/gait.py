@@ -130,6 +130,12 @@ def swing_ticks(config: GaitConfig, tick: Int[Array, "*batch"]) -> Int[Array, "*
     return jnp.where(contact(config, tick), 0, since)
 
 
+def since_touchdown(config: GaitConfig, tick: Int[Array, "*batch"]) -> Int[Array, "*batch feet"]:
+    """Return the ticks since the last touchdown of each foot, or since the gait's start."""
+    clock = _feet_ticks(config, tick)
+    return jnp.minimum(clock % config.cycle, clock - config._lead - config.first_tick)
+
+
 def ticks_to_touchdown(config: GaitConfig, tick: Int[Array, "*batch"]) -> Int[Array, "*batch feet"]:
     """Return the ticks until the next touchdown of each foot.
 

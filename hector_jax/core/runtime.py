@@ -16,7 +16,6 @@ from contextlib import contextmanager
 from importlib import import_module
 from multiprocessing import active_children, parent_process
 from multiprocessing.context import SpawnContext, SpawnProcess
-from multiprocessing.managers import SyncManager
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, cast
@@ -117,18 +116,6 @@ def _leave_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-@contextmanager
-def message_queue() -> Iterator[Any]:
-    """Create a queue of bytes that can be passed to jobs in worker processes.
-
-    Messages are to be pickled, because its manager process would load JAX to unpickle them.
-    """
-    manager = SyncManager(ctx=_Spawn())
-    manager.start(_leave_with_parent)
-    with manager:
-        yield manager.Queue()
 
 
 def start_worker(cores: Any) -> None:

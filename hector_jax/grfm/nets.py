@@ -118,6 +118,15 @@ def with_nets(params: _Params, nets: ByKind) -> _Params:
     return params._replace(**dict(zip(("force", "moment"), nets, strict=False)))
 
 
+def member(params: _Params, number: int) -> _Params:
+    """Return parameters of a variant with copies of one member in the place of all members."""
+
+    def copies(stacked: Any) -> np.ndarray:
+        return np.broadcast_to(stacked[number % len(stacked)], np.shape(stacked))
+
+    return with_nets(params, tuple(jax.tree.map(copies, net) for net in by_kind(params)))
+
+
 @partial(jax.jit, static_argnums=(0, 1))
 def _draw(net: Net, inputs: int, keys: Key[Array, " members"]) -> Any:
     return jax.vmap(lambda k: net.init(k, jnp.zeros(inputs))["params"])(keys)

@@ -1,7 +1,7 @@
 """report.md in the folder of a `hector tune` run."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +23,15 @@ def write_report(folder: Path, **contents: Any) -> Path:
         folder: where the pictures are.
         contents: all of these:
             trajectory, verdict: names of the trajectories; verdict of all sets on the stand-in.
-            tunings: by set, `without` and `with`.
+            tunings: by set, `without`, `with` and `best`.
             norms: gradient norms of the terms in log-weights at nominal, by model.
             determined: what the tuning `with` knows about its weights.
             errors: held-out errors of `raw`, `linear`, `net`, from `training.report`.
             proposals, best_proposal, cases: `Change`s of the tuning on walks; name of the set that
                 is `best`; number of walks per weight set.
-            chosen: chosen iteration by set, if it is not the last.
-            smooth: how often L_ctrl counted in the tunings.
+            chosen: name of the iteration that is `best`.
+            smooth: price of changes of the command between switches of stance in `best`.
+            draws: variations of the model for each trajectory of `best`.
             pictures, film: list of `Picture`; `Picture` of the film, or why there is none.
             config, environment: resolved settings, as JSON values; versions and machine.
             command: command line that repeats this run.
@@ -47,7 +48,7 @@ def write_report(folder: Path, **contents: Any) -> Path:
 def tuning_section(
     name: str,
     tuning: Tuning,
-    chosen: Mapping[str, int] | None = None,
+    chosen: str = "",
     where: str = "on the model",
 ) -> str:
     """Return the section of a tuning.
@@ -55,7 +56,7 @@ def tuning_section(
     Args:
         name: of the set.
         tuning: with its history.
-        chosen: the chosen iteration, if it is not the last.
+        chosen: name of the iteration that was taken; empty for the last.
         where: the loss was computed, in words.
     """
     values = {"name": name, "tuning": tuning, "chosen": chosen, "where": where}

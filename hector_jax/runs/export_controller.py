@@ -34,10 +34,9 @@ from hector_jax.control.controller import (
     WalkConfig,
     actuate,
     contacts_needed,
+    init_memory,
     step_plan,
 )
-from hector_jax.control.disturbance import NO_DISTURBANCE
-from hector_jax.control.footstep import Feet
 from hector_jax.control.legs import Measurement
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
 from hector_jax.control.weights import Weights
@@ -65,8 +64,9 @@ class _Heading(NamedTuple):
 
 def _idle(config: WalkConfig, robot: Robot, weights: Weights) -> tuple[_Heading, Memory, Plan]:
     """Return a carry of zeros with the shapes and dtypes of real ones."""
-    joints, feet = np.zeros_like(robot.standing_joints), len(robot.foot_point)
+    joints = np.zeros_like(robot.standing_joints)
     anchor = standing_anchor(robot)
+    measurement = Measurement(State(*np.zeros((4, 3))), joints, joints)
     shapes = jax.eval_shape(
         partial(step_plan, config),
         robot,
@@ -74,8 +74,8 @@ def _idle(config: WalkConfig, robot: Robot, weights: Weights) -> tuple[_Heading,
         command=_STILL,
         anchor=anchor,
         tick=np.int32(0),
-        memory=Memory(Feet(np.zeros((feet, 3)), np.zeros(feet)), NO_DISTURBANCE),
-        measurement=Measurement(State(*np.zeros((4, 3))), joints, joints),
+        memory=init_memory(robot, measurement),
+        measurement=measurement,
     )
     carry = _Heading(anchor.yaw, anchor, anchor.yaw), *shapes
     return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), carry)

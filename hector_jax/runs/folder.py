@@ -57,7 +57,6 @@ class RunRequest(NamedTuple):
 
     trajectory: str  # the first if there are several
     loss: Loss  # of the table
-    smooth: float  # how often L_ctrl counted while tuning
     data: Path  # folder of its net
     net: Path | None  # file of the net, if it is not in `data`
     variant: str  # of the net
@@ -90,7 +89,6 @@ def read_request(folder: Path) -> RunRequest:
         return RunRequest(
             trajectory=convert(flags["traj"], tuple[str, ...], name="traj")[0],
             loss=with_alphas(loss),
-            smooth=float(flags["smooth"]),
             data=Path(flags["data"]),
             net=flags["net"] and Path(flags["net"]),
             variant=str(flags["variant"]),

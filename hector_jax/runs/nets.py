@@ -28,6 +28,7 @@ from hector_jax.grfm.paper import LinearMap, fit_linear
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import Robot
 from hector_jax.runs.cache import content_key, robot_hash
+from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import TUNING_CODE, compile_programs, tune_config, tuning_paths
 from hector_jax.sim.engine import ENGINES, choose_engine
 
@@ -92,7 +93,8 @@ def collect(pool: Executor, config: CollectConfig, robot: Robot, folder: Path) -
     engine = choose_engine(config.engine)
     what = f"{plural(config.walks, 'walk')} on the high-fidelity simulator, engine {engine.name}"
     with locked(folder):
-        compile_programs(pool, tune_config(robot), robot, nominal(robot), command_of("straight"))
+        setup = Setup(pool, tune_config(robot), robot)
+        compile_programs(setup, nominal(robot), command_of("straight"))
         paths = tuning_paths(pool, robot, folder / "paths")
         jobs = draw_jobs(config.seed, config.walks, paths, seconds=config.seconds, robot=robot)
         with bar(f"collecting {what}") as report_progress:

@@ -4,11 +4,12 @@ On a CPU a tuning runs on one core, because a closed loop is one long chain of s
 several tunings run in parallel.
 """
 
-import pickle
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, NamedTuple
 
 import jax
@@ -20,9 +21,9 @@ from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.console import bar
 from hector_jax.core.identity import function_id
-from hector_jax.core.runtime import message_queue
 from hector_jax.core.tree import stack
 from hector_jax.grfm import network
+from hector_jax.grfm.nets import member
 from hector_jax.robot.model import Robot
 from hector_jax.runs.cache import content_key, load_or_make
 from hector_jax.runs.folder import add_iteration, write_histories
@@ -35,7 +36,7 @@ from hector_jax.tuning import batch, difftune, evaluate
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning, step_status
 from hector_jax.tuning.evaluate import Objective, mean_objective
 from hector_jax.tuning.loss import loss_of_robot
-from hector_jax.tuning.rollout import rollout_config
+from hector_jax.tuning.rollout import drawn_variation, rollout_config
 from hector_jax.tuning.status import StepStatus
 
 # modules that determine the numbers, for `content_key`
@@ -47,6 +48,7 @@ class Problem(NamedTuple):
 
     commands: tuple[Command, ...]  # for the same weights
     params: network.Params | None  # of the net to tune through; None: the plain rigid body
+    draws: int = 0  # drawn variations of the model for each command; 0: the model as it is
 
 
 class Tuned(NamedTuple):
@@ -68,54 +70,95 @@ def artefact(setup: Setup, start: Weights) -> dict[str, Any]:
     return {"like": lambda _: like, "kind": "tuning", "robot": setup.robot}
 
 
-def _tune_job(
-    config: TuneConfig, robot: Robot, start: Weights, problem: Problem, name: str, messages: Any
+def _scenarios(config: TuneConfig, robot: Robot, problem: Problem) -> list[dict[str, Any]]:
+    """Return command, anchor, effect and variation of each rollout of a problem.
+
+    A drawn one starts at the touchdown of a foot or half a cycle later, and its net is one member.
+    """
+    commands, params, draws = problem
+    walk = config.rollout.walk
+    if not draws:
+        model = {"anchor": standing_anchor(robot), "effect": network.effect_of(params, walk)}
+        return [{"command": command, **model} for command in commands]
+    scenarios = []
+    for seed, command in enumerate(command for command in commands for _ in range(draws)):
+        net = params if params is None else member(params, seed)
+        tick = seed % 2 * (walk.gait.cycle // 2)
+        scenario = {"anchor": standing_anchor(robot, tick), "effect": network.effect_of(net, walk)}
+        variation = drawn_variation(config.rollout, robot, seed)
+        scenarios.append({"command": command, **scenario, "variation": variation})
+    return scenarios
+
+
+def _evaluation_job(
+    config: TuneConfig, robot: Robot, weights: Weights, scenario: dict[str, Any]
+) -> evaluate.Evaluation:
+    return jax.device_get(difftune.tune_step(config, robot, weights, **scenario))
+
+
+def _matrix_job(
+    config: TuneConfig, robot: Robot, weights: Weights, scenario: dict[str, Any]
+) -> Float[np.ndarray, "n n"]:
+    return np.asarray(difftune.model_objective(config, robot, **scenario).matrix(weights))
+
+
+def _objective(setup: Setup, start: Weights, problem: Problem) -> Objective:
+    """Return the mean over the rollouts of a problem, each divided by its share at the start.
+
+    All rollouts of an evaluation, or their matrices, are computed at the same time. Drawn
+    variations with which the start falls are left out.
+    """
+    pool, config, robot, _ = setup
+
+    def of_all(
+        job: Callable[..., Any], scenarios: Sequence[dict[str, Any]], weights: Weights
+    ) -> list[Any]:
+        inputs = config, robot, jax.tree.map(np.asarray, weights)
+        return [f.result() for f in [pool.submit(job, *inputs, s) for s in scenarios]]
+
+    scenarios = _scenarios(config, robot, problem)
+    if len(scenarios) == 1:
+        losses = np.ones(1)
+    else:
+        found = of_all(_evaluation_job, scenarios, start)
+        usable = [i for i, e in enumerate(found) if step_status(config, e) == StepStatus.ACCEPTED]
+        kept = usable if usable and problem.draws else range(len(scenarios))
+        scenarios, losses = [scenarios[i] for i in kept], np.array([found[i].loss for i in kept])
+    evaluations = partial(of_all, _evaluation_job, scenarios)
+    return mean_objective(evaluations, partial(of_all, _matrix_job, scenarios), losses)
+
+
+def _tune_on_cpu(
+    setup: Setup, start: Weights, problem: Problem, put: Callable[[Iteration], None]
 ) -> Tuning:
-    """Run one tuning in a worker and put each iteration into the queue `messages`."""
-    objective = _objective(config, robot, start, problem)
-    put = lambda iteration: messages.put(pickle.dumps((name, iteration)))  # noqa: E731
-    return difftune.descend(config, start, objective, put)
+    """Run one tuning, whose rollouts worker processes compute."""
+    at = difftune.init(setup.config, start).start
+    return difftune.descend(setup.config, start, _objective(setup, at, problem), put)
 
 
 def _tune_on_gpu(setup: Setup, start: Weights, problem: Problem) -> Tuning:
     """Run one tuning on the accelerator, as a batch of one."""
-    pool, config, robot, _ = setup
-    models, scales = _models(config, robot, problem), np.ones(1)
+    _, config, robot, _ = setup
+    models, scales = _scenarios(config, robot, problem), np.ones(1)
     if len(models) > 1:
-        losses = pool.submit(_losses_job, config, robot, start, problem).result()
+        at = difftune.init(config, start).start
+        losses = np.array([_evaluation_job(config, robot, at, model).loss for model in models])
         scales = losses / losses.mean()
     scenarios = [
-        batch.Scenario(m["command"], m["anchor"], np.asarray(0), config.loss, np.asarray(scale))
-        for m, scale in zip(models, scales, strict=True)
+        batch.Scenario(
+            m["command"],
+            m["anchor"],
+            np.asarray(i),
+            config.loss,
+            np.asarray(scale),
+            m.get("variation"),
+        )
+        for i, (m, scale) in enumerate(zip(models, scales, strict=True))
     ]
     problems = stack([batch.Problem(start, stack(scenarios), np.asarray(1.0))])
-    found = batch.tune_batch(config, robot, problems, stack([models[0]["effect"]]))
+    effects = stack([model["effect"] for model in models])
+    found = batch.tune_batch(config, robot, problems, effects)
     return difftune.single(jax.tree.map(lambda x: x[0], found))
-
-
-def _losses_job(
-    config: TuneConfig, robot: Robot, start: Weights, problem: Problem
-) -> Float[np.ndarray, " commands"]:
-    """Return the loss of each command at the start."""
-    at, models = difftune.init(config, start).start, _models(config, robot, problem)
-    evaluations = [difftune.tune_step(config, robot, at, **model) for model in models]
-    return np.array([float(evaluation.loss) for evaluation in evaluations])
-
-
-def _objective(config: TuneConfig, robot: Robot, start: Weights, problem: Problem) -> Objective:
-    """Return the mean over the commands of a problem, each with equal influence at the start."""
-    models = _models(config, robot, problem)
-    objectives = [difftune.model_objective(config, robot, **model) for model in models]
-    if len(objectives) == 1:
-        return objectives[0]
-    return mean_objective(objectives, _losses_job(config, robot, start, problem))
-
-
-def _models(config: TuneConfig, robot: Robot, problem: Problem) -> list[dict[str, Any]]:
-    """Return command, anchor and effect of the rollout for each command of a problem."""
-    effect = network.effect_of(problem.params, config.rollout.walk)
-    model = {"anchor": standing_anchor(robot), "effect": effect}
-    return [{"command": command, **model} for command in problem.commands]
 
 
 def _tunings(
@@ -127,7 +170,8 @@ def _tunings(
 ) -> Iterator[tuple[str, Tuned]]:
     """Tune several problems in parallel and yield each tuning with its name when it ends.
 
-    Where there is a GPU they are tuned there, in turn.
+    Where there is a GPU they are tuned there, in turn; else threads of this process step the
+    weights and wait for the rollouts.
     """
     if jax.default_backend() == "gpu":
         with bar(title) as report_progress:
@@ -139,17 +183,19 @@ def _tunings(
                 yield name, Tuned(tuning, setup.commit)
         return
     done, total = 0, setup.config.iterations * len(problems)
-    inputs = setup.config, setup.robot, start
-    with message_queue() as messages, bar(title) as report_progress:
-        running: dict[Future[Tuning], str] = {
-            setup.pool.submit(_tune_job, *inputs, problem, name, messages): name
-            for name, problem in problems.items()
-        }
+    messages: SimpleQueue[tuple[str, Iteration]] = SimpleQueue()
+    threads = ThreadPoolExecutor(len(problems))
+    with ExitStack() as at_end, bar(title) as report_progress:
+        at_end.callback(threads.shutdown, wait=False)  # a failure does not wait for the others
+        running: dict[Future[Tuning], str] = {}
+        for name, problem in problems.items():
+            put = lambda iteration, name=name: messages.put((name, iteration))  # noqa: E731
+            running[threads.submit(_tune_on_cpu, setup, start, problem, put)] = name
         report_progress(done, total, "compiling")
         while running:
             ended = wait(running, timeout=0.1, return_when=FIRST_COMPLETED).done
             while not messages.empty():  # after `wait`: includes all messages of the ended tunings
-                name, iteration = pickle.loads(messages.get())
+                name, iteration = messages.get()
                 done += int(iteration.iteration > 0)
                 remark = f"{name}: L {float(iteration.evaluation.loss) / 1e6:.3f}e6"
                 report_progress(done, total, remark)
@@ -166,6 +212,7 @@ def tune(
     title: str,
     start: Weights | None = None,
     metrics: Path | None = None,
+    before: Mapping[str, Tuned] | None = None,
 ) -> dict[str, Tuned]:
     """Tune several problems in parallel; finished tunings are saved in `folder`.
 
@@ -179,6 +226,7 @@ def tune(
         start: weights at the start; the nominal weights by default.
         title: title of the progress bar.
         metrics: file of the iterations, see `folder.as_line`.
+        before: earlier tunings whose iterations are in that file too.
 
     Raises:
         InputError: with the weights at the start the model falls or a QP is not solved; or the
@@ -187,29 +235,33 @@ def tune(
     start = nominal(setup.robot) if start is None else start
     key = partial(content_key, setup.config, setup.robot, start, code=TUNING_CODE)
     paths = {}
-    for name, (commands, net) in problems.items():
+    for name, problem in problems.items():
+        net = problem.params
         phi = "" if net is None else function_id(network.variant_of(net).apply)
-        paths[name] = folder / f"tuning-{name}-{key(commands, net, phi)}.npz"
+        paths[name] = folder / f"tuning-{name}-{key(*problem, phi)}.npz"
+
+    def write(tuned: Mapping[str, Tuned]) -> None:
+        if metrics is not None:
+            histories = {**(before or {}), **tuned}.items()
+            write_histories(metrics, {name: t.tuning.iterations for name, t in histories})
 
     def on_iteration(name: str, iteration: Iteration) -> None:
         if metrics is not None:
             add_iteration(metrics, name, iteration)
 
     def make(missing: list[str], stored: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuned]]:
-        if metrics is not None:
-            write_histories(metrics, {n: tuned.tuning.iterations for n, tuned in stored.items()})
+        write(stored)
         remaining = {name: problems[name] for name in missing}
         return _tunings(setup, start, remaining, title, on_iteration)
 
     tuned = load_or_make(paths, make, **artefact(setup, start))
-    if metrics is not None:
-        write_histories(metrics, {n: result.tuning.iterations for n, result in tuned.items()})
+    write(tuned)
     return tuned
 
 
 def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:
     norms = partial(evaluate.gradient_norms, config.rollout, robot, nominal(robot))
-    results = [norms(**model, loss=config.loss) for model in _models(config, robot, problem)]
+    results = [norms(**model, loss=config.loss) for model in _scenarios(config, robot, problem)]
     return jax.tree.map(lambda *x: float(np.mean(x)), *results)
 
 
@@ -222,13 +274,10 @@ def gradient_norms(setup: Setup, problems: Mapping[str, Problem]) -> dict[str, d
         return {name: future.result() for name, future in running.items()}
 
 
-def gauss_newton_job(
-    config: TuneConfig, robot: Robot, start: Weights, problem: Problem
-) -> Float[np.ndarray, "n n"]:
-    """Return the Gauss-Newton matrix divided by the loss, mean over the commands, in a worker."""
-    losses = _losses_job(config, robot, start, problem)
-    matrix = _objective(config, robot, start, problem).matrix(start)
-    return np.asarray(matrix) / losses.mean()
+def gauss_newton(setup: Setup, start: Weights, problem: Problem) -> Float[np.ndarray, "n n"]:
+    """Return the Gauss-Newton matrix divided by the loss, mean over the commands."""
+    objective = _objective(setup, start, problem)
+    return np.asarray(objective.matrix(start)) / float(objective.evaluate(start).loss)
 
 
 def tune_config(robot: Robot, **settings: Any) -> TuneConfig:
@@ -253,55 +302,52 @@ def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
     return [stack([i.weights for i in history if i.accepted]) for history in histories]
 
 
-def _prepare_tuning(
-    config: TuneConfig, robot: Robot, start: Weights, command: Command, trace_only: bool
-) -> None:
-    """Compile the program of a tuning, or only trace it, so that its first call need not."""
-    (model,) = _models(config, robot, Problem((command,), None))
+def _prepare_tuning(config: TuneConfig, robot: Robot, start: Weights, problem: Problem) -> None:
+    """Compile the programs of a tuning, so that its first call need not."""
+    scenario, *_ = _scenarios(config, robot, problem)
     weights = difftune.init(config, start).start
-    objective = difftune.model_objective(config, robot, **model)
-    if trace_only:
-        for function in objective:
-            jax.eval_shape(function, weights)
-        return
-    evaluation = objective.evaluate(weights)
-    difftune.check_start(StepStatus(int(step_status(config, evaluation))), evaluation)
-    objective.matrix(weights)
+    evaluation = _evaluation_job(config, robot, weights, scenario)
+    if not problem.draws:
+        difftune.check_start(StepStatus(int(step_status(config, evaluation))), evaluation)
+    _matrix_job(config, robot, weights, scenario)
 
 
 def compile_programs(
-    pool: Executor,
-    config: TuneConfig,
-    robot: Robot,
+    setup: Setup,
     start: Weights,
     trajectory: NamedCommand,
     *,
+    others: Sequence[tuple[TuneConfig, Weights, Problem]] = (),
     meanwhile: Callable[[], None] = lambda: None,
 ) -> list[str]:
-    """Compile the programs of a tuning in one process; walk once and trace them in another one.
+    """Compile the programs of tunings in one process; walk once in another one.
 
     The other processes load the programs of both from the cache. The walk is with the weights at
     the start on the hfs; its faults that no weights can cure are returned, a line each.
 
     Args:
-        pool: worker processes.
-        config, robot, start, trajectory: of the tuning.
+        setup, start, trajectory: of the tuning on the rigid body.
+        others: settings, start and problem of tunings that need other programs.
         meanwhile: what is done at the same time; its jobs come after the walk.
 
     Raises:
         InputError: with the weights at the start the model falls or a QP is not solved.
     """
+    pool, config, robot, _ = setup
     job = Job(start, trajectory.command, hfs(robot.description))
     job = on_host(job._replace(seconds=trajectory.seconds or job.seconds))
-    on_hfs = config.rollout.walk, jax.tree.map(np.asarray, robot), job
-    inputs = config, robot, start, trajectory.command
-    walking = pool.submit(not_the_weights, *on_hfs)
-    tuning = pool.submit(_prepare_tuning, *inputs, False)
+    walking = pool.submit(
+        not_the_weights, config.rollout.walk, jax.tree.map(np.asarray, robot), job
+    )
+    plain = config, start, Problem((trajectory.command,), None)
+    preparing = [
+        pool.submit(_prepare_tuning, settings, robot, weights, problem)
+        for settings, weights, problem in (plain, *others)
+    ]
     meanwhile()
     with bar("compiling, once on a machine") as report_progress:
-        pool.submit(_prepare_tuning, *inputs, True)  # by a free process; `tuning` raises its errors
-        for done, future in enumerate((walking, tuning)):
-            report_progress(done, 2, "")
+        for done, future in enumerate((walking, *preparing)):
+            report_progress(done, 1 + len(preparing), "")
             future.result()
-        report_progress(2, 2, "")
+        report_progress(1 + len(preparing), 1 + len(preparing), "")
     return walking.result()

@@ -39,6 +39,7 @@ from hector_jax.grfm import network
 from hector_jax.runs import tunings
 from hector_jax.runs.cache import content_key, robot_hash
 from hector_jax.runs.campaign import Campaign, box_of, matrix_of, slope_of, walker_hash, weights_at
+from hector_jax.runs.setup import Setup
 from hector_jax.runs.walk_log import Log, ScoredLog, evaluate_log, log_of, read_log, trajectory_of
 from hector_jax.search import few_walks
 from hector_jax.search.cmaes import add_row, read_journal
@@ -116,8 +117,8 @@ def space_of(pool: Executor, campaign: Campaign) -> Space:
     robot, path = None if campaign.reported else campaign.robot, campaign.folder / "metric.npz"
     if not path.exists():
         problem = tunings.Problem(tuple(campaign.commands.values()), None)
-        inputs = campaign.config, campaign.robot, campaign.start, problem
-        matrix = pool.submit(tunings.gauss_newton_job, *inputs).result()
+        setup = Setup(pool, campaign.config, campaign.robot)
+        matrix = tunings.gauss_newton(setup, campaign.start, problem)
         save_tree(path, {"matrix": matrix}, kind="metric", robot=campaign.robot)
     tree, _ = load_tree(path, {"matrix": np.zeros((0, 0))}, kind="metric", robot=robot)
     return few_walks.space_of(tree["matrix"], box_of(campaign))

@@ -39,7 +39,7 @@ from hector_jax.tuning import step_rules
 from hector_jax.tuning.curvature import gauss_newton_jit
 from hector_jax.tuning.evaluate import Evaluation, Objective, evaluate_jit
 from hector_jax.tuning.loss import PAPER_LOSS, alphas, check_loss
-from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.rollout import RolloutConfig, Variation
 from hector_jax.tuning.status import StepStatus, Stop, status_text
 from hector_jax.tuning.step_rules import StepState
 
@@ -171,9 +171,11 @@ def tune_step(
     command: Command,
     anchor: Anchor,
     effect: jax.tree_util.Partial,
+    variation: Variation | None = None,
 ) -> Evaluation:
     """Evaluate weights with the rollout and the loss of a tuning, compiled."""
-    return evaluate_jit(config.rollout, robot, weights, command, anchor, effect, config.loss)
+    inputs = robot, weights, command, anchor, effect, config.loss, variation
+    return evaluate_jit(config.rollout, *inputs)
 
 
 def step_rule(config: TuneConfig, start: Weights) -> optax.GradientTransformationExtraArgs:
@@ -323,9 +325,10 @@ def model_objective(
     command: Command,
     anchor: Anchor,
     effect: jax.tree_util.Partial,
+    variation: Variation | None = None,
 ) -> Objective:
     """Return the objective of a tuning on the model, see `rollout`."""
-    model = {"command": command, "anchor": anchor, "effect": effect}
+    model = {"command": command, "anchor": anchor, "effect": effect, "variation": variation}
     matrix = partial(gauss_newton_jit, config.rollout, robot, loss=config.loss, **model)
     evaluate = partial(tune_step, config, robot, **model)
     return Objective(evaluate, partial(matrix, others=config.others))

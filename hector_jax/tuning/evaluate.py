@@ -80,37 +80,30 @@ class Objective(NamedTuple):
     matrix: Callable[[Weights], Any]  # Gauss-Newton matrix (n, n) in the steps of the tuning
 
 
-def mean_of(evaluations: Sequence[Evaluation], scales: Float[np.ndarray, " n"]) -> Evaluation:
-    """Average evaluations, each divided by its scale; `fallen` and `residual` are the worst."""
-    evaluations = jax.device_get(evaluations)
-    return _mean(evaluations, scales)._replace(
-        fallen=np.max([e.fallen for e in evaluations]),
-        residual=np.max([e.residual for e in evaluations]),
-    )
-
-
-def _mean(trees: Sequence[Any], scales: Float[np.ndarray, " n"]) -> Any:
-    scaled = [jax.tree.map(lambda x, k=k: x / k, t) for t, k in zip(trees, scales, strict=True)]
-    return jax.tree.map(lambda *values: np.mean(values, axis=0), *scaled)
-
-
 def mean_objective(
-    objectives: Sequence[Objective], losses: Float[np.ndarray, " n"] | None = None
+    evaluations: Callable[[Weights], Sequence[Evaluation]],
+    matrices: Callable[[Weights], Sequence[Any]],
+    losses: Float[np.ndarray, " n"] | None = None,
 ) -> Objective:
-    """Return the mean of objectives, see `mean_of`.
+    """Return the mean of several objectives, given by all their evaluations and matrices.
 
     Each is divided by its share of the losses, those at the start, so that all have equal
-    influence; without losses all count as they are.
+    influence; without losses all count as they are. `fallen` and `residual` are the worst.
     """
-    scales = np.ones(len(objectives)) if losses is None else losses / losses.mean()
+
+    def mean(trees: Sequence[Any]) -> Any:
+        scales = np.ones(len(trees)) if losses is None else losses / losses.mean()
+        scaled = [jax.tree.map(lambda x, k=k: x / k, t) for t, k in zip(trees, scales, strict=True)]
+        return jax.tree.map(lambda *values: np.mean(values, axis=0), *scaled)
 
     def evaluate(weights: Weights) -> Evaluation:
-        return mean_of([objective.evaluate(weights) for objective in objectives], scales)
+        found = jax.device_get(evaluations(weights))
+        return mean(found)._replace(
+            fallen=np.max([e.fallen for e in found]),
+            residual=np.max([e.residual for e in found]),
+        )
 
-    def matrix(weights: Weights) -> Float[np.ndarray, "n n"]:
-        return _mean([np.asarray(objective.matrix(weights)) for objective in objectives], scales)
-
-    return Objective(evaluate, matrix)
+    return Objective(evaluate, lambda weights: mean(list(map(np.asarray, matrices(weights)))))
 
 
 def gradient_norms(

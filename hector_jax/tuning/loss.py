@@ -190,10 +190,23 @@ def with_alphas(weights: Mapping[str, Any], loss: Loss = PAPER_LOSS) -> Loss:
     return weighted
 
 
-def smoother(loss: Loss, factor: float) -> Loss:
-    """Return a loss in which L_ctrl, if it has that term, counts `factor` times."""
-    weights = {term.name: factor * term.weight for term in loss if term.name == "L_ctrl"}
-    return with_alphas(weights, loss)
+def between_loss(trajectory: Trajectory) -> Float[Array, ""]:
+    """Sum the squared changes of the command between switches of stance: L_ctrl without those."""
+    return control_loss(trajectory) - switch_loss(trajectory)
+
+
+def smoother(loss: Loss, price: float) -> Loss:
+    """Return a loss to which changes of the command between switches of stance are added.
+
+    They cost `price` times what they cost in L_ctrl, in addition to that; a loss without L_ctrl
+    stays as it is.
+    """
+    added = (
+        LossTerm("L_between", term.unit, price * term.weight, between_loss)
+        for term in loss
+        if price and term.name == "L_ctrl"
+    )
+    return (*loss, *added)
 
 
 def loss_of_robot(description: Description) -> Loss:

@@ -4,8 +4,8 @@ This is the only world that is differentiated. A tick solves the MPC, evaluates 
 of the ground and moves the body; its only memory is `Carry`. A foot in the air moves to the
 touchdown that phi predicts, and an early touchdown that phi predicts acts there.
 
-A `Variation` makes the body and its ground differ from the controller's model, for weights that
-have to be robust to that.
+A `Variation` makes the body and its ground differ from the controller's model; weights that are
+tuned over several drawn ones are robust to that.
 """
 
 from dataclasses import dataclass
@@ -73,6 +73,9 @@ def rollout_config(robot: Robot, ticks: int = RolloutConfig.ticks) -> RolloutCon
         raise InputError(f"{robot.description.path}: tuning: {error}") from None
 
 
+_ESTIMATED = ("angle", "position", "ang_velocity", "velocity")  # names of the fields of a State
+
+
 class Variation(NamedTuple):
     """Difference of the world from the controller's model; see `no_variation`."""
 
@@ -96,10 +99,38 @@ def variation_of(config: RolloutConfig) -> Variation | None:
     """Return the variation by the noise and the delay of a config; None if it has neither."""
     if not config.estimate_noise and not config.delay:
         return None
-    names = ("angle", "position", "ang_velocity", "velocity")
-    noise = State(*(np.full(3, config.estimate_noise * ESTIMATE_NOISE[name]) for name in names))
+    sizes = (config.estimate_noise * ESTIMATE_NOISE[name] for name in _ESTIMATED)
+    noise = State(*(np.full(3, size) for size in sizes))
     variation = no_variation()._replace(noise=noise, delay=np.asarray(config.delay))
     return jax.tree.map(jnp.asarray, variation)
+
+
+_SHARPNESS = 8  # of the edge of the friction pyramid
+_MASS, _INERTIA = 0.1, 0.2  # half widths of the drawn factors
+_COM = (0.024, 0.024, 0.048)  # half width of the drawn offset, as a share of the standing height
+_FRICTION = (0.8, 1.6)  # of the ground, as a share of the plan's
+_DELAY = 0.8  # ticks, the most
+
+
+def drawn_variation(config: RolloutConfig, robot: Robot, seed: int) -> Variation:
+    """Draw a variation as robots may differ, with the noise of a real robot's estimate.
+
+    Args:
+        config: its plan's friction and tick.
+        robot: its height.
+        seed: equal seeds give equal numbers, that of the noise too.
+    """
+    rng, walk = np.random.default_rng([0x7A5, seed]), config.walk
+    noise = State(*(np.full(3, ESTIMATE_NOISE[name]) for name in _ESTIMATED))
+    return Variation(
+        mass=np.asarray(rng.uniform(1.0 - _MASS, 1.0 + _MASS)),
+        inertia=np.asarray(rng.uniform(1.0 - _INERTIA, 1.0 + _INERTIA)),
+        com=float(robot.standing_height) * np.array(_COM) * rng.uniform(-1.0, 1.0, 3),
+        friction=np.asarray(walk.mpc.friction * rng.uniform(*_FRICTION)),
+        delay=np.asarray(walk.gait.tick * rng.uniform(0.0, _DELAY)),
+        noise=noise,
+        seed=np.asarray(seed),
+    )
 
 
 class Carry(NamedTuple):
@@ -155,11 +186,12 @@ def _estimate_error(variation: Variation, state: State, tick: Int[Array, ""]) ->
 
 
 def _within_friction(wrench: Wrench, friction: Float[Array, ""]) -> Wrench:
-    """Scale the horizontal forces of feet that slip down to the friction pyramid."""
+    """Scale the horizontal forces of feet smoothly into the friction pyramid."""
     horizontal = jnp.sum(jnp.abs(wrench.force[:, :2]), axis=-1)
     limit = friction * jnp.maximum(wrench.force[:, 2], 0.0)
-    slips = horizontal > limit
-    share = jnp.where(slips, limit / jnp.where(slips, horizontal, 1.0), 1.0)
+    # below 1 / use, at four fifths of the limit 0.98 and at the limit 0.92
+    use = horizontal / jnp.maximum(limit, 1e-3)
+    share = (1.0 + use**_SHARPNESS) ** (-1.0 / _SHARPNESS)
     return wrench._replace(force=wrench.force.at[:, :2].multiply(share[:, None]))
 
 
