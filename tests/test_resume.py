@@ -474,7 +474,7 @@ def line(*words):
     [
         (("--seeds", 8), "run: begun with --seeds 3, got 8"),
         (("--traj", "straight"), "run: begun with --traj c, got straight"),
-        (("--smooth", 10), "run: begun with --smooth 2.0, got 10"),
+        (("--smooth", 3), "run: begun with --smooth 2.0, got 3"),
         (("--walk-plants", 2), "run: begun with --walk-plants 1, got 2"),
         (("--start", "nominal"), "run: begun with --start expert, got nominal"),
     ],

@@ -177,7 +177,7 @@ class Tune(Configured, Parallel):
     variant: Variant = "residual"  # architecture of the net
     alpha: Literal["paper", "auto"] = "paper"  # loss weights; auto makes the gradient norms alike
     # price in `best` of changes of the command between switches of stance: more, smoother commands
-    smooth: Annotated[float, Range(0, 1000)] = 10.0
+    smooth: Annotated[float, Range(0, 1000)] = 3.0
     # limit [m] of the position error that the MPC sees in `best`: with less it tracks worse and may
     # fall less under pushes; default 0.19 of the robot's height
     safe: Annotated[float | None, Range(0.001, 10)] = None

@@ -2,7 +2,8 @@
 
 The plan trusts its friction coefficient. On a floor that has less, a foot slips whenever the plan
 uses all of it, step after step, until the robot falls. State estimate and encoders show a slip: a
-foot in stance moves in the world. Then the plan takes a share of its friction, which grows back.
+foot in stance moves in the world. Then the plan takes a share of its friction, the smaller the
+further the foot has moved, which grows back.
 """
 
 from dataclasses import dataclass
@@ -24,8 +25,8 @@ _LANDING = 3  # ticks of a stance before the foot has come to rest
 class SlipConfig:
     """What counts as a slip, and what follows from it."""
 
-    distance: Annotated[float, POSITIVE] = 0.06  # that the foot moves, by the standing height
-    share: Annotated[float, SHARE] = 0.5  # of the plan's friction after a slip; 1: no reaction
+    distance: Annotated[float, POSITIVE] = 0.06  # of a foot's motion, by the standing height
+    share: Annotated[float, SHARE] = 0.5  # of the plan's friction after twice that; 1: no reaction
     recovery: Annotated[float, POSITIVE] = 2.0  # [s] until the plan has all of its friction again
 
     def __post_init__(self) -> None:
@@ -65,5 +66,5 @@ def feel(
     planted = jnp.where(rests[:, None], grip.planted, feet)
     moved = jnp.linalg.norm((feet - planted)[:, :2], axis=-1)
     grown = grip.share + (1.0 - config.share) * ticks.tick / config.recovery
-    slips = jnp.any(moved > config.distance * height)
-    return Grip(planted, jnp.where(slips, config.share, jnp.minimum(grown, 1.0)))
+    slip = jnp.clip(jnp.max(moved) / (config.distance * height) - 1.0, 0.0, 1.0)
+    return Grip(planted, jnp.minimum(grown, 1.0 - (1.0 - config.share) * slip))
