@@ -249,31 +249,6 @@ def survival(path: Path, rows: Mapping[str, Mapping[str, Any]]) -> str:
     )
 
 
-def push_directions(path: Path, pushes: Mapping[str, Float[np.ndarray, "8"]]) -> str:
-    """Draw the largest push survived, by its direction.
-
-    Args:
-        path: file to write.
-        pushes: [N] by set, in steps of 45 degrees to the left, the first ahead.
-    """
-    angles = np.deg2rad(45.0 * np.arange(9))
-    with drawing(path, 4.6, 4.4, legend_columns=3) as figure:
-        axes: Any = figure.subplots(subplot_kw={"projection": "polar", "theta_offset": np.pi / 2})
-        for name, look in looks_of(pushes).items():
-            line = {"marker": look.marker, "label": label_of(name), **look.line}
-            forces = np.append(pushes[name], pushes[name][0])
-            axes.plot(angles, forces, markersize=3.5, **line)
-        axes.set_rmin(0.0)
-        axes.set_rlabel_position(22.5)
-        axes.yaxis.set_major_formatter(lambda force, _: f"{force:g} N")
-        axes.set_title("Largest push of 0.1 s survived, by where it pushes to", pad=14)
-        axes.set_xticks(angles[:-1], ["ahead", "", "left", "", "back", "", "right", ""])
-    return (
-        "Largest push [N] of 0.1 s that is survived together with all smaller ones, by where it "
-        "pushes to; mean over plants and gait phases."
-    )
-
-
 _PHI = {  # colour, marker, and hatch of bars
     "command": ("black", ".", None),
     "linear": (style.PURPLE, "^", "//////"),

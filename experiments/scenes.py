@@ -3,20 +3,22 @@
 Scenes have a kind and a level: a push of 50 N, a floor of friction 0.4. The scenes of one level
 differ in direction and gait phase; every set walks all of them on every plant. Two numbers describe
 a level: the share of its walks without a fall, and the median of the paired ratios of L to the
-baseline's. Their intervals redraw the plants, each with all of its scenes.
+baseline's. Their intervals redraw the plants, each with all of its scenes. Whether a set falls more
+often than the baseline is an exact one-sided sign test on the scenes in which one of them falls.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import permutations
 from typing import Any, NamedTuple
 
 import numpy as np
 from changes import TRUNK_TOP, Change
-from jaxtyping import Bool, Float
+from scipy.stats import binom
 
 from hector_jax.control.gait import GaitConfig
-from hector_jax.control.reference import COMMANDS, UNSEEN, Command, named_command
+from hector_jax.control.reference import Command, named_command
 from hector_jax.control.weights import Weights
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, check
@@ -24,13 +26,14 @@ from hector_jax.report.report import markdown_table
 from hector_jax.robot.description import HECTOR, PlantSizes
 from hector_jax.runs.metrics import Interval, Score, bootstrap, falls_comparable
 from hector_jax.sim.loop import Job
-from hector_jax.sim.world import NO_PUSH, Imperfections, Push
+from hector_jax.sim.world import NO_PUSH, Imperfections, Push, noisy
 
 DIRECTIONS = 45 * np.arange(8)  # [deg] of the pushes, from ahead to the left
 PUSH_START, PUSH_TIME, PUSH_WALK = 0.8, 0.1, 2.5  # [s] the walk includes the recovery
 SLIPPERY = 1.0, 3.0  # [s] start and end of a slippery floor
 PAYLOAD, PAYLOAD_LATE = 2.0, 2.0  # [kg]; [s] when it is put on in a walk
 SLOPE = np.deg2rad(3.0)
+DELAYS, LAG = (0.006, 0.008), 0.006  # [s] of slow motors, with a noisy estimate
 _GAIT = GaitConfig()
 SLOPES = {"up": (SLOPE, 0.0), "down": (-SLOPE, 0.0), "left": (0.0, SLOPE), "right": (0.0, -SLOPE)}
 """Slopes by the side to which the floor rises, seen from the walk's start."""
@@ -43,23 +46,27 @@ class Scene(NamedTuple):
     seconds: float = 4.0
     push: Push = NO_PUSH
     changes: tuple[Change, ...] = ()
+    delay: float | None = None  # [s] of the motors, in place of the plant's
 
     def job(self, weights: Weights, plant: Imperfections, seed: int) -> Job:
         """Return the walk of a weight set on a plant, without the changes."""
+        if self.delay is not None:
+            slow = {"delay": np.asarray(self.delay), "lag": np.asarray(LAG)}
+            plant = plant._replace(**slow, estimator=noisy())
         return Job(weights, self.command, plant, self.seconds, seed, push=self.push)
 
 
 class Level(NamedTuple):
     """Kind and size of the disturbance of a group of scenes."""
 
-    kind: str  # calm, push, friction, slope, payload or command
-    size: float | str  # [N] of a push, friction of a floor; else a name
+    kind: str  # calm, push, friction, slope, payload or delay
+    size: float | str  # [N] of a push, friction of a floor, [ms] of a delay; else a name
 
     @property
     def name(self) -> str:
         """Name of the row in a table."""
         size = self.size if isinstance(self.size, str) else f"{self.size:g}"
-        return f"{self.kind} {size}" + (" N" if self.kind == "push" else "")
+        return f"{self.kind} {size}" + {"push": " N", "delay": " ms"}.get(self.kind, "")
 
 
 class Cell(NamedTuple):
@@ -71,21 +78,22 @@ class Cell(NamedTuple):
     falls_by_plant: tuple[int, ...]
     walks: int
     counts: bool  # the falls of both sets allow a comparison, see metrics
+    more: int  # scenes in which it falls and the baseline does not
+    fewer: int  # the other way round
+    p: float  # of so many more or more, if both fell alike
 
 
 @dataclass(frozen=True)
 class SceneConfig:
     """Which scenes."""
 
-    traj: str = "straight"  # walked in all scenes but those of kind command
     # of the pushes [N], of another robot times its size
-    forces: tuple[float, ...] = (25.0, 50.0, 75.0, 100.0, 125.0, 150.0)
-    frictions: tuple[float, ...] = (0.5, 0.4, 0.3, 0.25, 0.2)  # that the floor steps to
+    forces: tuple[float, ...] = (50.0, 75.0, 100.0, 125.0)
+    frictions: tuple[float, ...] = (0.55, 0.5, 0.45, 0.4, 0.35, 0.3)  # that the floor steps to
     phases: int = 3  # of the gait, at which a push or a slippery floor begins
 
     def __post_init__(self) -> None:
-        trajectories = (*COMMANDS, *UNSEEN)
-        check(self, traj=trajectories, forces=POSITIVE, frictions=POSITIVE, phases=AT_LEAST_ONE)
+        check(self, forces=POSITIVE, frictions=POSITIVE, phases=AT_LEAST_ONE)
         for name in ("forces", "frictions"):
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
@@ -95,16 +103,20 @@ class SceneConfig:
 
 
 def make_scenes(
-    config: SceneConfig, gait: GaitConfig = _GAIT, sizes: PlantSizes = HECTOR.plants
+    config: SceneConfig,
+    traj: str,
+    gait: GaitConfig = _GAIT,
+    sizes: PlantSizes = HECTOR.plants,
 ) -> dict[Level, list[Scene]]:
     """Return all scenes by level; those of a push are ordered by direction, then by phase.
 
     Args:
         config: the scenes.
+        traj: name of the command that is walked.
         gait: of the robot.
         sizes: of the robot's pushes, payloads and lengths.
     """
-    command = named_command(config.traj)
+    command = named_command(traj)
     # t = 0 begins a cycle
     delays = gait.tick * gait.cycle * np.arange(config.phases) / config.phases
     start, end = SLIPPERY
@@ -117,7 +129,7 @@ def make_scenes(
     def changed(change: Change) -> Scene:
         return Scene(command, changes=(change,))
 
-    scenes = {Level("calm", config.traj): [Scene(command)]}
+    scenes = {Level("calm", "floor"): [Scene(command)]}
     for force in sizes.push * np.array(config.forces):
         scenes[Level("push", float(force))] = [
             pushed(force, side, t) for side in np.deg2rad(DIRECTIONS) for t in delays
@@ -133,9 +145,8 @@ def make_scenes(
     late = early._replace(start=PAYLOAD_LATE)
     scenes[Level("payload", f"{payload:g} kg from the start")] = [changed(early)]
     scenes[Level("payload", f"{payload:g} kg put on at 2 s")] = [changed(late)]
-    for name in UNSEEN:
-        unseen = named_command(name)
-        scenes[Level("command", name)] = [Scene(unseen, max(4.0, float(unseen.duration.sum())))]
+    for delay in DELAYS:
+        scenes[Level("delay", 1e3 * delay)] = [Scene(command, delay=delay)]
     return scenes
 
 
@@ -146,6 +157,7 @@ def evaluate_level(scores: Score, baseline: Score) -> Cell:
         scores: (plants, scenes) each.
         baseline: (plants, scenes) on the same plants and scenes; may be the same set.
     """
+    more, fewer = (int(np.sum(a & ~b)) for a, b in permutations((scores.fallen, baseline.fallen)))
     return Cell(
         survived=bootstrap(partial(np.mean, axis=(-2, -1)), ~scores.fallen),
         ratio=bootstrap(partial(np.median, axis=(-2, -1)), scores.L / baseline.L),
@@ -153,22 +165,20 @@ def evaluate_level(scores: Score, baseline: Score) -> Cell:
         falls_by_plant=tuple(scores.fallen.sum(axis=1).tolist()),
         walks=scores.fallen.size,
         counts=falls_comparable(scores.fallen, baseline.fallen),
+        more=more,
+        fewer=fewer,
+        p=float(binom.sf(more - 1, more + fewer, 0.5)),
     )
 
 
-def largest_pushes(
-    fallen: Mapping[float, Bool[np.ndarray, "plants scenes"]],
-) -> Float[np.ndarray, "8"]:
-    """Return the force [N] survived with all smaller ones, by direction; mean of plants, phases.
-
-    Args:
-        fallen: by force, in the order of `make_scenes`.
-    """
-    forces = np.array(sorted(fallen))
-    upright = np.stack([~fallen[force] for force in forces])
-    count = np.logical_and.accumulate(upright, axis=0).sum(axis=0)  # of the forces
-    largest = np.append(0.0, forces)[count].reshape(count.shape[0], len(DIRECTIONS), -1)
-    return largest.mean(axis=(0, 2))
+def significant(p: Sequence[float], level: float = 0.05) -> list[int]:
+    """Return the indices of the p values that Holm's step-down method rejects together."""
+    found: list[int] = []
+    for index in np.argsort(p):
+        if p[index] > level / (len(p) - len(found)):
+            break
+        found.append(int(index))
+    return found
 
 
 def table(cells: Mapping[Level, Mapping[str, Cell]], losses: Mapping[Level, float]) -> str:
