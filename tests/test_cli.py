@@ -201,7 +201,7 @@ def test_a_robot_without_a_best_set_says_so(monkeypatch, capsys, tmp_path):
 def test_the_name_best_is_the_set_of_the_robot():
     found = arguments.weights("best", load_robot())
     jax.tree.map(np.testing.assert_array_equal, found, best())
-    assert found.others == BEST_OTHERS
+    assert found.others == {**found.others, **BEST_OTHERS}
 
 
 def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
