@@ -306,7 +306,7 @@ def shown_change(sets, world):
     change, falls = tuned["change"]["nominal"], (start["falls"], tuned["falls"])
     text = "{median:+.0f} [{low:+.0f}, {high:+.0f}]".format(**change)
     assert change["counts"] == (falls == (0, 0))
-    return text if change["counts"] else f"{text}; nominal fell {falls[0]} times, `best` {falls[1]}"
+    return text if change["counts"] else f"{text}; nominal fell {falls[0]} times, `with` {falls[1]}"
 
 
 def test_the_table_of_other_robots_is_that_of_its_file():
