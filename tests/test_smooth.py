@@ -21,7 +21,7 @@ from hector_jax.control.trajectories import command_of
 from hector_jax.control.weights import nominal
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
-from hector_jax.runs import tunings
+from hector_jax.runs import choice, tunings
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Tuned
 from hector_jax.tuning.loss import alphas, between_loss, control_loss, switch_loss
@@ -53,7 +53,7 @@ def test_best_alone_is_tuned_smoothly_on_drawn_models_with_its_own_numbers(monke
     before = alphas(CONFIG.loss)
     assert alphas(config.loss) == {**before, "L_between": 3.0 * before["L_ctrl"]}
     assert config.others == GROUPS["integral"]
-    assert (config.rollout, problem.draws) == (CONFIG.rollout, command.DRAWS)
+    assert (config.rollout, problem.draws) == (CONFIG.rollout, choice.DRAWS)
     jax.tree.map(np.testing.assert_array_equal, start[:2], nominal()[:2])
 
 

@@ -18,8 +18,6 @@ from hector_jax.cli.flags import BASELINES, Tune, Walk
 from hector_jax.cli.parse import as_command
 from hector_jax.cli.verdict import small_verdict
 from hector_jax.control.parameters import (
-    GROUPS,
-    TUNABLES,
     leg_numbers,
     model_numbers,
     step_names,
@@ -39,7 +37,7 @@ from hector_jax.report import fidelity, pictures
 from hector_jax.report.report import Picture, print_table
 from hector_jax.report.run import write_report
 from hector_jax.report.video import check_film
-from hector_jax.robot.model import Robot, load_robot
+from hector_jax.robot.model import load_robot
 from hector_jax.runs import choice, metrics, nets, tunings, verdicts
 from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, read_object
 from hector_jax.runs.setup import Setup
@@ -53,15 +51,8 @@ from hector_jax.sim.world import hfs
 from hector_jax.tuning.curvature import Determined, determined
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.evaluate import aligned
-from hector_jax.tuning.loss import smoother
 
 _ARTEFACTS = "kept"  # folder in it
-DRAWS = 4  # variations of the model for each command of `best`
-LIMIT, WIDTH, FEEDBACK = 0.19, 7 / 8, 2 / 3
-"""Numbers of `best` beside its weights: limit of the position error as a share of the height of the
-centre of mass, unless --safe sets it; width and velocity feedback of the steps as shares of the
-controller's."""
-HELD_OUT = 8  # plants that compare the sets of a tuning on walks
 
 
 def tune(args: Tune) -> None:
@@ -100,7 +91,9 @@ class _Run(NamedTuple):
     @property
     def answer(self) -> tuple[TuneConfig, Weights]:
         """Settings and start of the tuning of `best`."""
-        return _answer(self.setup.config, self.args, self.setup.robot, self.start)
+        _, config, robot, _ = self.setup
+        smooth, safe = self.args.smooth, self.args.safe
+        return choice.settings_of_best(config, robot, self.start, smooth=smooth, safe=safe)
 
     @property
     def seconds(self) -> float:
@@ -150,7 +143,9 @@ def _tune_in(folder: Path, args: Tune) -> None:
         inputs = setup, args.start, start, trajectories, folder / _ARTEFACTS / "hfs"
         check = partial(_check_start, *inputs)
         command = trajectories[0].command
-        best = *_answer(config, args, robot, start), tunings.Problem((command,), None, 1)
+        prices = {"smooth": args.smooth, "safe": args.safe}
+        of_best = choice.settings_of_best(config, robot, start, **prices)
+        best = *of_best, tunings.Problem((command,), None, 1)
         options = {"others": [best], "meanwhile": check}
         for line in tunings.compile_programs(setup, start, trajectories[0], **options):
             say(f"before any tuning, {trajectories[0].name} on hfs: {line}")
@@ -183,7 +178,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         cases=len(tuned.proposals[0].losses) if tuned.proposals else 0,
         chosen=tuned.chosen,
         smooth=args.smooth,
-        draws=DRAWS,
+        draws=choice.DRAWS,
         **_draw(run, tuned, *walks[trajectories[0].name]),
         config=settings,
         environment=made_with,
@@ -198,28 +193,6 @@ def _tune_in(folder: Path, args: Tune) -> None:
 
     print_result(args.json, {"run": str(folder), "traj": run.name, **result}, print_text)
     say(f"the report is {report}")
-
-
-def _answer(
-    config: TuneConfig, args: Tune, robot: Robot, start: Weights
-) -> tuple[TuneConfig, Weights]:
-    """Return settings and start of the tuning of `best` from those of `without` and `with`.
-
-    It tunes the gains of the integral action too, and pays for changes of the command. It begins
-    with a limit of the position error and with steps that endure pushes (docs/decisions.md).
-    """
-    others = tuple(dict.fromkeys((*config.others, *GROUPS["integral"])))
-    walk = config.rollout.walk
-    limit = args.safe or walk.mpc.position_limit or round(LIMIT * float(robot.standing_height), 3)
-    numbers = {
-        "position_limit": limit,
-        "footstep_width": round(WIDTH * walk.footstep.width, 4),
-        "footstep_feedback": round(FEEDBACK * walk.footstep.feedback, 4),
-    }
-    boxes = {name: (TUNABLES[name].lower, TUNABLES[name].upper) for name in numbers}
-    clipped = {name: float(np.clip(numbers[name], *boxes[name])) for name in numbers}
-    start = start._replace(others={**clipped, **start.others})
-    return replace(config, loss=smoother(config.loss, args.smooth), others=others), start
 
 
 def _check_start(
@@ -270,13 +243,15 @@ def _tune_sets(run: _Run) -> _Tuned:
     """Tune without and with the net; write the weights."""
     setup, commands = run.setup, list(run.commands.values())
     config, start = run.answer
-    problem = {"best": tunings.Problem(tuple(commands), run.net.params, DRAWS)}
+    problem = {"best": tunings.Problem(tuple(commands), run.net.params, choice.DRAWS)}
     folder = run.folder / _ARTEFACTS
     tune_in = partial(tunings.tune, folder=folder, metrics=run.folder / METRICS)
     title = f"tuning {run.name} without and with GRFM-Net"
     done = tune_in(setup, run.problems, title=title, start=run.start)
     for_best = setup._replace(config=config)
-    title = f"tuning {run.name} on {plural(DRAWS * len(commands), 'drawn model')}, for `best`"
+    title = (
+        f"tuning {run.name} on {plural(choice.DRAWS * len(commands), 'drawn model')}, for `best`"
+    )
     done |= tune_in(for_best, problem, title=title, start=start, before=done)
     results = {name: entry.tuning for name, entry in done.items()}
     options = {"seconds": run.seconds, "folder": folder / "choice"}
@@ -295,7 +270,7 @@ def _tune_sets(run: _Run) -> _Tuned:
         campaign = _campaign(run, sets["before_walks"])
         proposals = tune_on_walks(setup.pool, campaign, run.args.walks)
         stages = candidates(setup.pool, campaign, proposals)
-        inputs = setup, stages, commands, HELD_OUT
+        inputs = setup, stages, commands, choice.HELD_OUT
         best = choice.walks_best(*inputs, **options, engine=campaign.engine)
         sets["best"] = stages[best]
     for name, weights in sets.items():

@@ -102,11 +102,30 @@ def _matrix_job(
     return np.asarray(difftune.model_objective(config, robot, **scenario).matrix(weights))
 
 
+def _usable(
+    config: TuneConfig,
+    problem: Problem,
+    scenarios: list[dict[str, Any]],
+    found: Sequence[evaluate.Evaluation],
+) -> tuple[list[dict[str, Any]], Float[np.ndarray, " n"]]:
+    """Return the rollouts of a problem that count, and their losses at the start.
+
+    Drawn variations with which the start falls are left out, if not all are.
+
+    Args:
+        config, problem: of the tuning.
+        scenarios: all rollouts.
+        found: their evaluations at the start.
+    """
+    usable = [i for i, e in enumerate(found) if step_status(config, e) == StepStatus.ACCEPTED]
+    kept = usable if usable and problem.draws else range(len(scenarios))
+    return [scenarios[i] for i in kept], np.array([found[i].loss for i in kept])
+
+
 def _objective(setup: Setup, start: Weights, problem: Problem) -> Objective:
     """Return the mean over the rollouts of a problem, each divided by its share at the start.
 
-    All rollouts of an evaluation, or their matrices, are computed at the same time. Drawn
-    variations with which the start falls are left out.
+    All rollouts of an evaluation, or their matrices, are computed at the same time.
     """
     pool, config, robot, _ = setup
 
@@ -116,14 +135,10 @@ def _objective(setup: Setup, start: Weights, problem: Problem) -> Objective:
         inputs = config, robot, jax.tree.map(np.asarray, weights)
         return [f.result() for f in [pool.submit(job, *inputs, s) for s in scenarios]]
 
-    scenarios = _scenarios(config, robot, problem)
-    if len(scenarios) == 1:
-        losses = np.ones(1)
-    else:
+    scenarios, losses = _scenarios(config, robot, problem), np.ones(1)
+    if len(scenarios) > 1:
         found = of_all(_evaluation_job, scenarios, start)
-        usable = [i for i, e in enumerate(found) if step_status(config, e) == StepStatus.ACCEPTED]
-        kept = usable if usable and problem.draws else range(len(scenarios))
-        scenarios, losses = [scenarios[i] for i in kept], np.array([found[i].loss for i in kept])
+        scenarios, losses = _usable(config, problem, scenarios, found)
     evaluations = partial(of_all, _evaluation_job, scenarios)
     return mean_objective(evaluations, partial(of_all, _matrix_job, scenarios), losses)
 
@@ -139,22 +154,16 @@ def _tune_on_cpu(
 def _tune_on_gpu(setup: Setup, start: Weights, problem: Problem) -> Tuning:
     """Run one tuning on the accelerator, as a batch of one."""
     _, config, robot, _ = setup
-    models, scales = _scenarios(config, robot, problem), np.ones(1)
+    models, losses = _scenarios(config, robot, problem), np.ones(1)
     if len(models) > 1:
         at = difftune.init(config, start).start
-        losses = np.array([_evaluation_job(config, robot, at, model).loss for model in models])
-        scales = losses / losses.mean()
-    scenarios = [
-        batch.Scenario(
-            m["command"],
-            m["anchor"],
-            np.asarray(i),
-            config.loss,
-            np.asarray(scale),
-            m.get("variation"),
-        )
-        for i, (m, scale) in enumerate(zip(models, scales, strict=True))
-    ]
+        found = [_evaluation_job(config, robot, at, model) for model in models]
+        models, losses = _usable(config, problem, models, found)
+    scenarios = []
+    for i, (model, scale) in enumerate(zip(models, losses / losses.mean(), strict=True)):
+        place = model["command"], model["anchor"], np.asarray(i)
+        weighed = *place, config.loss, np.asarray(scale), model.get("variation")
+        scenarios.append(batch.Scenario(*weighed))
     problems = stack([batch.Problem(start, stack(scenarios), np.asarray(1.0))])
     effects = stack([model["effect"] for model in models])
     found = batch.tune_batch(config, robot, problems, effects)
