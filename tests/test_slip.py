@@ -28,7 +28,7 @@ def course(moves, config=CONFIG, start=0):
     for tick, move in enumerate(moves, start):
         feet = jnp.asarray(FEET).at[0, 0].add(move)
         grip = feel(config, GAIT, 0.5, grip, feet, jnp.asarray(tick))
-        shares.append(float(grip.share))
+        shares.append(1.0 - float(grip.lost))
     return np.array(shares)
 
 

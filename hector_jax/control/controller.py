@@ -272,7 +272,7 @@ def step_plan(
     feet = measured_feet(robot, measurement)
     inputs = config.slip, config.gait, robot.standing_height, memory.grip
     grip = feel(*inputs, feet.position, tick)
-    mpc = parameters.mpc._replace(friction=grip.share * parameters.mpc.friction)
+    mpc = parameters.mpc._replace(friction=(1.0 - grip.lost) * parameters.mpc.friction)
     planned, disturbance = plan(
         config,
         robot,

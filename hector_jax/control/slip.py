@@ -37,12 +37,12 @@ class Grip(NamedTuple):
     """What the controller knows about the floor; see `first_grip`."""
 
     planted: Float[Array, "*batch feet 3"]  # [m] where each foot came to rest, in the world
-    share: Float[Array, "*batch"]  # of the plan's friction
+    lost: Float[Array, "*batch"]  # share of the plan's friction that it does not use
 
 
 def first_grip(feet: Float[Array | np.ndarray, "feet 3"]) -> Grip:
     """Return the grip of a robot that stands with its feet at these points [m]."""
-    return Grip(jnp.asarray(feet), jnp.ones(()))
+    return Grip(jnp.asarray(feet), jnp.zeros(()))
 
 
 def feel(
@@ -65,6 +65,6 @@ def feel(
     rests = gait.contact(ticks, tick) & (gait.since_touchdown(ticks, tick) >= _LANDING)
     planted = jnp.where(rests[:, None], grip.planted, feet)
     moved = jnp.linalg.norm((feet - planted)[:, :2], axis=-1)
-    grown = grip.share + (1.0 - config.share) * ticks.tick / config.recovery
     slip = jnp.clip(jnp.max(moved) / (config.distance * height) - 1.0, 0.0, 1.0)
-    return Grip(planted, jnp.minimum(grown, 1.0 - (1.0 - config.share) * slip))
+    most = 1.0 - config.share
+    return Grip(planted, jnp.maximum(grip.lost - most * ticks.tick / config.recovery, most * slip))
