@@ -89,7 +89,7 @@ def test_pushes_of_the_data_have_the_size_of_the_robot():
 
 def test_scenes_push_and_load_as_much_as_the_robot_is_large():
     config = SceneConfig(forces=(50.0,), frictions=(0.4,), phases=1)
-    scenes = make_scenes(config, sizes=SIZES)
+    scenes = make_scenes(config, "straight", sizes=SIZES)
     force = scenes[Level("push", 250.0)][0].push.force
     np.testing.assert_allclose(np.linalg.norm(force), 250.0)
     (loaded,) = scenes[Level("payload", "8 kg from the start")]
