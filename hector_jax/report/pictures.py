@@ -46,7 +46,7 @@ def of_run(
         The pictures, in the order of the report.
     """
     walks = {name: walks[name] for name in ("nominal", "expert", "with", "best")}
-    compared = ("nominal", "expert", "without", "with")
+    compared = ("nominal", "expert", "without", "with", "best")
     vectors = {name: np.asarray(weights_to_vector(sets[name])) for name in compared}
     histories = {name: tunings[name].iterations for name in ("without", "with")}
     path, tick = folder / "pictures", config.rollout.walk.gait.tick

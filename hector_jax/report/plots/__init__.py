@@ -186,17 +186,19 @@ def weights(
     Args:
         path: file to write.
         names: names of the weights, from `weight_names`.
-        sets: `nominal`, `expert` and the tuned `without`, `with`, flat in the order of `names`.
+        sets: `nominal`, `expert` and tuned sets, flat in the order of `names`.
     """
     ratio = {name: np.divide(values, sets["nominal"]) for name, values in sets.items()}
-    bars = [name for name in ("without", "with") if name in sets]
+    bars = [name for name in ("without", "with", "best") if name in sets]
     with drawing(path, 10.0, 3.4) as figure:
         axes = figure.subplots()
         for i, name in enumerate(bars):
-            x = np.arange(len(names)) + 0.38 * (i - (len(bars) - 1) / 2)
+            x = np.arange(len(names)) + 0.8 / len(bars) * (i - (len(bars) - 1) / 2)
             look = {"color": SETS[name]["color"], "hatch": "////" if name == "without" else None}
             look |= {"edgecolor": "white", "linewidth": 0.0}
-            axes.bar(x, ratio[name] - 1.0, 0.36, bottom=1.0, **look, label=label_of(name))
+            axes.bar(
+                x, ratio[name] - 1.0, 0.76 / len(bars), bottom=1.0, **look, label=label_of(name)
+            )
         if "expert" in sets:
             look = looks_of(["expert"])["expert"].dot
             axes.plot(ratio["expert"], **look, markerfacecolor="white", label="expert")
