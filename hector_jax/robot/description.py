@@ -14,7 +14,7 @@
     left, right = { body, contacts = [[x, y, z], ...], point = [x, y, z] }   # as many
     [limits]
     min_height, max_tilt               # [m] of the centre of mass, [rad]: beyond them it has fallen
-    [gait] [mpc] [footstep] [legs]     # fields of GaitConfig, MpcConfig, FootstepConfig, LegConfig
+    [gait] [mpc] [slip] [footstep] [legs]  # fields of GaitConfig, MpcConfig, SlipConfig and so on
     [weights]                          # each an x, y, z triple or a single number
     nominal, expert = { euler, position, ang_velocity, velocity, force, moment }
     [loss]                             # weights of the loss terms: L_Eul, L_pos, L_ctrl
@@ -44,7 +44,7 @@ DESCRIPTION_PATH = _ASSETS / "hector.toml"
 
 LEG_JOINTS = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle")
 FEWEST_JOINTS, MOST_JOINTS = 3, 7  # of a leg
-CONTROL = ("gait", "mpc", "footstep", "legs")  # sections that the controller reads
+CONTROL = ("gait", "mpc", "slip", "footstep", "legs")  # sections that the controller reads
 
 MAX_BYTES = 100_000
 
@@ -314,6 +314,7 @@ class _File:
     limits: _Limits = _Limits()
     gait: dict | None = None
     mpc: dict | None = None
+    slip: dict | None = None
     footstep: dict | None = None
     legs: dict | None = None
     weights: _Weights = _Weights()
