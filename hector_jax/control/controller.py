@@ -88,6 +88,7 @@ def walk_config(robot: Robot) -> WalkConfig:
     path = str(robot.description.path)
     table = {name: dict(section) for name, section in robot.description.control}
     table["mpc"] = {"contact": robot.structure.contact, **table.get("mpc", {})}
+    table.setdefault("slip", {"share": 1.0})  # the feet of other robots may move without a slip
     config = from_table(path, WalkConfig, table)
     feet = len(robot.foot_point)
     if len(config.gait.offsets) != feet:

@@ -26,7 +26,7 @@ class SlipConfig:
     """What counts as a slip, and what follows from it."""
 
     distance: Annotated[float, POSITIVE] = 0.06  # of a foot's motion, by the standing height
-    share: Annotated[float, SHARE] = 1.0  # of the plan's friction after twice that; 1: no reaction
+    share: Annotated[float, SHARE] = 0.5  # of the plan's friction after twice that; 1: no reaction
     recovery: Annotated[float, POSITIVE] = 2.0  # [s] until the plan has all of its friction again
 
     def __post_init__(self) -> None:
