@@ -27,7 +27,7 @@ def course(moves, config=CONFIG, start=0):
     grip, shares = first_grip(FEET), []
     for tick, move in enumerate(moves, start):
         feet = jnp.asarray(FEET).at[0, 0].add(move)
-        grip = feel(config, GAIT, 0.5, grip, feet, jnp.asarray(tick))
+        grip = feel(config, GAIT, 0.5, grip, feet=feet, tick=jnp.asarray(tick))
         shares.append(1.0 - float(grip.lost))
     return np.array(shares)
 

@@ -17,11 +17,7 @@ from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import BASELINES, Tune, Walk
 from hector_jax.cli.parse import as_command
 from hector_jax.cli.verdict import small_verdict
-from hector_jax.control.parameters import (
-    leg_numbers,
-    model_numbers,
-    step_names,
-)
+from hector_jax.control.parameters import leg_numbers, model_numbers, step_names
 from hector_jax.control.reference import Command
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import Weights, expert, nominal

@@ -271,8 +271,8 @@ def step_plan(
 ) -> tuple[Memory, Plan]:
     """Run `plan` on a measurement and remember feet and grip; call once a tick."""
     feet = measured_feet(robot, measurement)
-    inputs = config.slip, config.gait, robot.standing_height, memory.grip
-    grip = feel(*inputs, feet.position, tick)
+    now = {"feet": feet.position, "tick": tick}
+    grip = feel(config.slip, config.gait, robot.standing_height, memory.grip, **now)
     mpc = parameters.mpc._replace(friction=(1.0 - grip.lost) * parameters.mpc.friction)
     planned, disturbance = plan(
         config,

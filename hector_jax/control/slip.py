@@ -18,7 +18,7 @@ from hector_jax.control.gait import GaitConfig
 from hector_jax.core.arrays import Array
 from hector_jax.core.settings import POSITIVE, SHARE, check
 
-_LANDING = 3  # ticks of a stance before the foot has come to rest
+_LANDING = 0.03  # [s] of a stance until the foot has come to rest
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,7 @@ def feel(
     ticks: GaitConfig,
     height: Any,
     grip: Grip,
+    *,
     feet: Float[Array, "feet 3"],
     tick: Int[Array, ""],
 ) -> Grip:
@@ -62,7 +63,8 @@ def feel(
         feet: measured foot points in the world [m].
         tick: current gait tick.
     """
-    rests = gait.contact(ticks, tick) & (gait.since_touchdown(ticks, tick) >= _LANDING)
+    since = ticks.tick * gait.since_touchdown(ticks, tick)
+    rests = gait.contact(ticks, tick) & (since > _LANDING - 0.5 * ticks.tick)
     planted = jnp.where(rests[:, None], grip.planted, feet)
     moved = jnp.linalg.norm((feet - planted)[:, :2], axis=-1)
     slip = jnp.clip(jnp.max(moved) / (config.distance * height) - 1.0, 0.0, 1.0)

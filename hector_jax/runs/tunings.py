@@ -1,7 +1,7 @@
 """The step `tune`: tunings in worker processes or on a GPU, each an artefact (cache.py).
 
-On a CPU a tuning runs on one core, because a closed loop is one long chain of small operations;
-several tunings run in parallel.
+On a CPU a rollout runs on one core, because a closed loop is one long chain of small operations;
+the rollouts of a tuning, and several tunings, run in parallel.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -159,14 +159,14 @@ def _tune_on_gpu(setup: Setup, start: Weights, problem: Problem) -> Tuning:
         at = difftune.init(config, start).start
         found = [_evaluation_job(config, robot, at, model) for model in models]
         models, losses = _usable(config, problem, models, found)
+    effects = [model["effect"] for model in models] if problem.draws else [models[0]["effect"]]
     scenarios = []
     for i, (model, scale) in enumerate(zip(models, losses / losses.mean(), strict=True)):
-        place = model["command"], model["anchor"], np.asarray(i)
+        place = model["command"], model["anchor"], np.asarray(i % len(effects))
         weighed = *place, config.loss, np.asarray(scale), model.get("variation")
         scenarios.append(batch.Scenario(*weighed))
     problems = stack([batch.Problem(start, stack(scenarios), np.asarray(1.0))])
-    effects = stack([model["effect"] for model in models])
-    found = batch.tune_batch(config, robot, problems, effects)
+    found = batch.tune_batch(config, robot, problems, stack(effects))
     return difftune.single(jax.tree.map(lambda x: x[0], found))
 
 
@@ -329,9 +329,9 @@ def compile_programs(
     others: Sequence[tuple[TuneConfig, Weights, Problem]] = (),
     meanwhile: Callable[[], None] = lambda: None,
 ) -> list[str]:
-    """Compile the programs of tunings in one process; walk once in another one.
+    """Compile the programs of tunings, each in one process, and walk once in another one.
 
-    The other processes load the programs of both from the cache. The walk is with the weights at
+    The other processes load these programs from the cache. The walk is with the weights at
     the start on the hfs; its faults that no weights can cure are returned, a line each.
 
     Args:
