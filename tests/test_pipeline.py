@@ -235,6 +235,26 @@ def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, m
             jax.tree.map(np.testing.assert_array_equal, first, each[0])
 
 
+@pytest.mark.parametrize("falls", [{1}, {0, 1, 2}])
+def test_drawn_models_with_which_the_start_falls_are_left_out(robot, monkeypatch, capsys, falls):
+    def tune_step(config, robot, weights, command, anchor, effect, variation):
+        seed = int(variation.seed)
+        loss, fallen = np.array(1.0 + seed), np.array(float(seed in falls))
+        return Evaluation(loss, {}, nominal(), fallen, np.array(0.0))
+
+    monkeypatch.setattr(tunings.difftune, "tune_step", tune_step)
+    setup = Setup(ThreadPoolExecutor(2), TuneConfig(), robot)
+    problem = tunings.Problem((named_command("s"),), None, 3)
+    found = tunings._objective(setup, nominal(), problem).evaluate(nominal())
+    said = capsys.readouterr().err
+    assert found.loss == pytest.approx(2.0)  # the mean of 1 and 3, or of all
+    if len(falls) == 1:
+        assert found.fallen == 0.0
+        assert "1 of 3 drawn models left out of the tuning: the weights at the start fall" in said
+    else:  # `descend` refuses the start
+        assert (found.fallen, said) == (1.0, "")
+
+
 def test_what_takes_the_mean_over_commands_is_in_the_key_of_a_tuning():
     source = environment._source("tuning.difftune").read_bytes()
     modules = {*tunings.TUNING_CODE, *environment._syntax(source)[1]}

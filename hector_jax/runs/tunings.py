@@ -19,8 +19,9 @@ from jaxtyping import Float
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import Weights, nominal
-from hector_jax.core.console import bar
+from hector_jax.core.console import bar, say
 from hector_jax.core.identity import function_id
+from hector_jax.core.inputs import plural
 from hector_jax.core.tree import stack
 from hector_jax.grfm import network
 from hector_jax.grfm.nets import member
@@ -119,6 +120,11 @@ def _usable(
     """
     usable = [i for i, e in enumerate(found) if step_status(config, e) == StepStatus.ACCEPTED]
     kept = usable if usable and problem.draws else range(len(scenarios))
+    if left_out := len(scenarios) - len(kept):
+        say(
+            f"{left_out} of {plural(len(scenarios), 'drawn model')} left out of the tuning: the "
+            "weights at the start fall or are not solved there"
+        )
     return [scenarios[i] for i in kept], np.array([found[i].loss for i in kept])
 
 
