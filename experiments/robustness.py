@@ -221,8 +221,9 @@ def report(
         f"{residual:.0e}{'.' if residual <= SOLVED else ': **not solved**.'}",
         *(
             f"{one['falls']} of {one['walks']} walks fall with `{name}`"
-            + f"; more often than with `{BASELINE}`, by the test below, in: "
-            f"{', '.join(one['falls_more']) or 'no row'}." * (name != BASELINE)
+            + f"; rows with more falls than `{BASELINE}`, by the test below: "
+            f"{', '.join(one['falls_more']) or 'none'}" * (name != BASELINE)
+            + "."
             for name, one in totals.items()
         ),
         f"L / {BASELINE} is the median of the ratio in the same scene on the same plant, falls "
