@@ -222,8 +222,7 @@ def report(
         *(
             f"{one['falls']} of {one['walks']} walks fall with `{name}`"
             + f"; rows with more falls than `{BASELINE}`, by the test below: "
-            f"{', '.join(one['falls_more']) or 'none'}" * (name != BASELINE)
-            + "."
+            f"{', '.join(one['falls_more']) or 'none'}" * (name != BASELINE) + "."
             for name, one in totals.items()
         ),
         f"L / {BASELINE} is the median of the ratio in the same scene on the same plant, falls "
