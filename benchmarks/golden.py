@@ -38,6 +38,7 @@ from hector_jax.core.console import say
 from hector_jax.core.runtime import setup_jax
 from hector_jax.core.trajectory import State, Trajectory
 from hector_jax.core.tree import stack
+from hector_jax.export.export import controller, export_controller, load_controller
 from hector_jax.grfm import dataset, training
 from hector_jax.grfm.collection import Walks
 from hector_jax.grfm.effect import last_command
@@ -46,7 +47,6 @@ from hector_jax.grfm.network import as_effect, effect_of
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.qp import QpConfig, solve_qp
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs.export import controller, export_controller, load_controller
 from hector_jax.sim.loop import Job
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.standin import standin

@@ -49,11 +49,11 @@ from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import nets
-from hector_jax.runs.cache import content_key, load_or_make
 from hector_jax.sim.loop import Job
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections, named_world
+from hector_jax.store import nets
+from hector_jax.store.cache import content_key, load_or_make
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 

@@ -47,17 +47,19 @@ from hector_jax.core.tree_file import load_tree, save_tree
 from hector_jax.grfm.network import effect_of
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import tunings, verdicts, walks
-from hector_jax.runs.cache import content_key
-from hector_jax.runs.campaign import Campaign, box_of, weights_at
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.walks import Row
 from hector_jax.search import few_walks
 from hector_jax.search.few_walks import Proposal, Space
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.world import hfs, named_world
+from hector_jax.store import tunings
+from hector_jax.store.cache import content_key
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.loss import Loss, loss_of
 from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.verdict import judging
+from hector_jax.walk_tuning import walks
+from hector_jax.walk_tuning.campaign import Campaign, box_of, weights_at
+from hector_jax.walk_tuning.walks import Row
 
 BUDGETS = (0, 1, 5, 10, 25, 50, 100, 200)
 WALKS = "walks"
@@ -318,7 +320,7 @@ def read_model(pool: Executor, campaign: Campaign, *, searches: bool) -> Model:
     It is computed once, in a folder of its own for all that it depends on.
     """
     settings = campaign.config, campaign.robot, campaign.start, tuple(campaign.commands.values())
-    key = content_key(*settings, SEARCHES, function_id(search_job), code=("runs.walks",))
+    key = content_key(*settings, SEARCHES, function_id(search_job), code=("walk_tuning.walks",))
     campaign = replace(campaign, folder=campaign.folder / key)
     path, size = campaign.folder / "searches.npz", len(box_of(campaign))
     parts = {"steps": np.zeros((0, size)), "losses": np.zeros(0)}
@@ -407,7 +409,7 @@ def judge(setup: Setup, flags: Flags, bests: Bests) -> dict[tuple[Contest, int],
         sets = {_set_name(key[0], best): best.weights for key, best in of_traj.items()}
         inputs = setup, sets, named_command(traj), plants, seeds
         options = {"title": f"judging {traj}", "folder": flags.out / "scores"}
-        scores = verdicts.judge(*inputs, **options, engine=choose_engine(flags.engine)).scores
+        scores = judging.judge(*inputs, **options, engine=choose_engine(flags.engine)).scores
         for key, best in of_traj.items():
             each = scores[_set_name(key[0], best)]
             fell = any(score.fallen for score in each)

@@ -27,8 +27,9 @@ from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, check
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import choice, nets, tunings, verdicts
-from hector_jax.runs.setup import Setup
+from hector_jax.store import nets, tunings
+from hector_jax.store.setup import Setup
+from hector_jax.verdict import choice, judging
 
 FIRST_SEED = 7100
 PROBLEMS = {**{name: (name,) for name in COMMANDS}, "all": COMMANDS}
@@ -78,7 +79,7 @@ def walk_robot(flags: Flags, pool: Executor, name: str, file: Path | None) -> Lo
         }
         inputs = setup, compared, named_command(command), plants, seeds
         options = {"title": f"{name}: walking {command}", "folder": flags.out / "scores" / name}
-        scores = verdicts.judge(*inputs, **options).scores
+        scores = judging.judge(*inputs, **options).scores
         losses[command] = {key: [float(s.L) for s in rows] for key, rows in scores.items()}
     return losses
 

@@ -31,15 +31,16 @@ from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.settings import Range, read_json
 from hector_jax.report.report import print_table
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import metrics, nets
-from hector_jax.runs.metrics import Verdict
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.tunings import Tuned
-from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.search.cmaes import SearchConfig, SearchResult
 from hector_jax.sim.standin import FAMILIES
 from hector_jax.sim.world import Imperfections
+from hector_jax.store import nets
+from hector_jax.store.setup import Setup
+from hector_jax.store.tunings import Tuned
 from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.verdict import metrics
+from hector_jax.verdict.judging import ScoredWalks
+from hector_jax.verdict.metrics import Verdict
 
 PROGRAM = "python experiments/table.py"
 SETS = ("nominal", "expert", "search_200", "paper", "without", "with", "with_walks")

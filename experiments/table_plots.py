@@ -17,7 +17,7 @@ from hector_jax.report.plots.style import drawing, label_of, log_axis, looks_of
 from hector_jax.report.report import Picture, caption
 from hector_jax.report.video import VideoConfig, VideoUnavailable, write_strip
 from hector_jax.robot.model import Robot
-from hector_jax.runs.metrics import BASELINES, Verdict, compare
+from hector_jax.verdict.metrics import BASELINES, Verdict, compare
 
 _MAIN = ("nominal", "expert", "without", "with")  # more lines cannot be distinguished
 _BEST = "search_2000"

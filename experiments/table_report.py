@@ -21,9 +21,9 @@ from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.settings import read_json
 from hector_jax.report.report import TEMPLATES, Picture, change_text, column, seeds_text, wins_text
 from hector_jax.report.run import tuning_section
-from hector_jax.runs import metrics
-from hector_jax.runs.metrics import BASELINES, Comparison, Summary, Verdict
 from hector_jax.tuning.difftune import Tuning
+from hector_jax.verdict import metrics
+from hector_jax.verdict.metrics import BASELINES, Comparison, Summary, Verdict
 
 PAPER = {
     "straight": {

@@ -20,21 +20,23 @@ from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.grfm.network import Params, effect_of
 from hector_jax.robot.model import Robot
-from hector_jax.runs import searches, tunings, verdicts
-from hector_jax.runs.cache import content_key, load_or_make
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.tunings import Problem, Tuned
-from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.search.cmaes import SearchConfig, SearchResult
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
+from hector_jax.store import tunings
+from hector_jax.store.cache import content_key, load_or_make
+from hector_jax.store.setup import Setup
+from hector_jax.store.tunings import Problem, Tuned
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
+from hector_jax.verdict import judging
+from hector_jax.verdict.judging import ScoredWalks
+from hector_jax.walk_tuning import searches
 
 # modules of the package that decide the numbers, for `content_key`
-SEARCH_CODE = ("runs.searches", "sim.walk", "sim.parallel")
+SEARCH_CODE = ("walk_tuning.searches", "sim.walk", "sim.parallel")
 WALKS_CODE = (*tunings.TUNING_CODE, "tuning.grounded", "sim.walk")
 
 
@@ -145,7 +147,7 @@ def judge(
     seeds: Sequence[int],
 ) -> ScoredWalks:
     """Walk all sets on the plants, along one trajectory."""
-    return verdicts.judge(
+    return judging.judge(
         bench.setup,
         sets,
         named_command(name),

@@ -54,12 +54,12 @@ from hector_jax.grfm.collection import fingerprint
 from hector_jax.grfm.effect import Effect, Window, last_command
 from hector_jax.grfm.network import Params, as_effect
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import nets, tunings
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.tunings import Problem
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
+from hector_jax.store import nets, tunings
+from hector_jax.store.setup import Setup
+from hector_jax.store.tunings import Problem
 from hector_jax.tuning.difftune import TuneConfig, step_status, tune_step
 from hector_jax.tuning.loss import PAPER_LOSS, loss_of
 from hector_jax.tuning.rollout import RolloutConfig, rollout

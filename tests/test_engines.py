@@ -15,12 +15,12 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.headless import mujoco
 from hector_jax.robot.model import load_robot
-from hector_jax.runs.metrics import score
 from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Push, build_world, hfs, ideal
 from hector_jax.tuning.loss import PAPER_LOSS
+from hector_jax.verdict.metrics import score
 
 HECTOR = load_robot()
 CONFIG = walk_config(HECTOR)

@@ -34,11 +34,9 @@ from hector_jax.control.weights import expert, nominal, vector_to_weights, weigh
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, pack_wrench
-from hector_jax.qp import QP, Status
-from hector_jax.robot.model import load_robot
-from hector_jax.runs import export
-from hector_jax.runs.cache import robot_hash
-from hector_jax.runs.export import (
+from hector_jax.export import export
+from hector_jax.export.controller import Check, _measured, check, record
+from hector_jax.export.export import (
     PLATFORMS,
     SCHEMA,
     TOLERANCE,
@@ -49,7 +47,9 @@ from hector_jax.runs.export import (
     weights_cpp,
     weights_schema,
 )
-from hector_jax.runs.export_controller import Check, _measured, check, record
+from hector_jax.qp import QP, Status
+from hector_jax.robot.model import load_robot
+from hector_jax.store.cache import robot_hash
 
 pytestmark = pytest.mark.usefixtures("on_cpu")
 ROBOT, CONFIG = load_robot(), WalkConfig()

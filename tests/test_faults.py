@@ -21,9 +21,9 @@ from hector_jax.control.weights import nominal, weights_to_vector
 from hector_jax.core.inputs import InputError
 from hector_jax.report.run import tuning_section
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import tunings
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.tunings import Problem
+from hector_jax.store import tunings
+from hector_jax.store.setup import Setup
+from hector_jax.store.tunings import Problem
 from hector_jax.tuning import rollout
 from hector_jax.tuning.difftune import TuneConfig, descend
 from hector_jax.tuning.evaluate import Evaluation, Objective

@@ -18,11 +18,11 @@ from hector_jax.control.controller import walk_config
 from hector_jax.control.legs import stance_torques
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import FEET, State, Wrench, pack_wrench
+from hector_jax.importing.propose import propose
+from hector_jax.importing.remarks import remarks
+from hector_jax.importing.survey import survey_file
 from hector_jax.robot import srbm
 from hector_jax.robot.description import description_of
-from hector_jax.robot.importer.propose import propose
-from hector_jax.robot.importer.remarks import remarks
-from hector_jax.robot.importer.survey import survey_file
 from hector_jax.robot.kinematics import foot_poses, leg_gravity
 from hector_jax.robot.model import compile_model, load_robot, robot_of
 

@@ -17,17 +17,17 @@ from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
-from hector_jax.grfm.dataset import at_interval
-from hector_jax.grfm.effect import last_command
-from hector_jax.robot.model import load_robot
-from hector_jax.runs.export import (
+from hector_jax.export.controller import check, record
+from hector_jax.export.export import (
     TOLERANCE,
     controller,
     export_controller,
     load_controller,
     weights_schema,
 )
-from hector_jax.runs.export_controller import check, record
+from hector_jax.grfm.dataset import at_interval
+from hector_jax.grfm.effect import last_command
+from hector_jax.robot.model import load_robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import walk

@@ -15,13 +15,13 @@ from hector_jax.cli.main import main
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import as_toml
 from hector_jax.core.tree_file import save_tree
+from hector_jax.importing.propose import propose
+from hector_jax.importing.remarks import remarks
+from hector_jax.importing.survey import survey_file
+from hector_jax.importing.table import table_of
 from hector_jax.robot.description import read_description
-from hector_jax.robot.importer.propose import propose
-from hector_jax.robot.importer.remarks import remarks
-from hector_jax.robot.importer.source import build_spec
-from hector_jax.robot.importer.survey import survey_file
-from hector_jax.robot.importer.table import table_of
 from hector_jax.robot.model import compile_model, load_robot
+from hector_jax.robot.source import build_spec
 
 HUMANOID = Path(__file__).parents[1] / "examples" / "humanoid" / "humanoid.xml"
 

@@ -16,11 +16,11 @@ from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.grfm.effect import last_command
 from hector_jax.report.report import render
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import metrics
-from hector_jax.runs.folder import as_line
+from hector_jax.store.folder import as_line
 from hector_jax.tuning.difftune import TuneConfig, tune
 from hector_jax.tuning.loss import PAPER_LOSS, LossTerm, losses, switch_loss, total, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.verdict import metrics
 
 NAMES = ["L_Eul", "L_pos", "L_ctrl"]
 parts_of, switches_of = jax.jit(partial(losses, PAPER_LOSS)), jax.jit(switch_loss)

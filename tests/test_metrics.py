@@ -7,8 +7,8 @@ import pytest
 from pretend import SETS, pretend_score, pretend_verdict, pretend_walk
 
 from hector_jax.core.files import as_json
-from hector_jax.runs import metrics
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
+from hector_jax.verdict import metrics
 
 
 def mean_of(x):

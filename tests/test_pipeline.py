@@ -32,17 +32,18 @@ from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.grfm.paper import PaperParams
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import nets, searches, tunings
-from hector_jax.runs.metrics import score
-from hector_jax.runs.nets import CollectConfig
-from hector_jax.runs.setup import Setup
 from hector_jax.sim.engine import ENGINES, MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
+from hector_jax.store import nets, tunings
+from hector_jax.store.nets import CollectConfig
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import Evaluation, mean_objective
 from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.verdict.metrics import score
+from hector_jax.walk_tuning import searches
 
 
 @pytest.fixture(scope="module")

@@ -17,16 +17,16 @@ from hector_jax.cli.main import main
 from hector_jax.control.controller import walk_config
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import as_toml
+from hector_jax.importing.propose import HEIGHT, MASS, propose
+from hector_jax.importing.remarks import remarks
+from hector_jax.importing.soles import find_soles
+from hector_jax.importing.survey import survey_file
 from hector_jax.robot.description import (
     DESCRIPTION_PATH,
     MODEL_PATH,
     description_of,
     read_description,
 )
-from hector_jax.robot.importer.propose import HEIGHT, MASS, propose
-from hector_jax.robot.importer.remarks import remarks
-from hector_jax.robot.importer.soles import find_soles
-from hector_jax.robot.importer.survey import survey_file
 from hector_jax.robot.model import compile_model, load_robot, robot_of
 from hector_jax.robot.response import response, swing_frequency
 from hector_jax.tuning.loss import loss_of_robot

@@ -11,9 +11,9 @@ from pretend import pretend_score, pretend_tuning, pretend_verdict
 from table_report import PAPER, Fall, Search, Table, summaries, write_table
 
 from hector_jax.report.report import Picture
-from hector_jax.runs import metrics
-from hector_jax.runs.metrics import BASELINES
 from hector_jax.tuning.loss import PAPER_LOSS
+from hector_jax.verdict import metrics
+from hector_jax.verdict.metrics import BASELINES
 
 
 def judged(seeds=4, fell=(), **levels):

@@ -25,16 +25,16 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import save_tree
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import campaign as campaigns
-from hector_jax.runs import reported_walks, walk_log, walks
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.tunings import Tuned
 from hector_jax.sim.engine import ENGINES, MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
+from hector_jax.store.setup import Setup
+from hector_jax.store.tunings import Tuned
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import loss_of
+from hector_jax.walk_tuning import campaign as campaigns
+from hector_jax.walk_tuning import reported_walks, walk_log, walks
 
 # all walks of this file are of these ticks and this command: one set of programs for all tests
 CONFIG, COMMAND, SECONDS = TuneConfig(rollout=BRIEF), {"short": AHEAD}, 0.05

@@ -18,20 +18,22 @@ from hector_jax.core.files import locked, make_folder, write_file, write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
 from hector_jax.core.settings import as_toml
+from hector_jax.export import export
 from hector_jax.grfm.training import TrainConfig
+from hector_jax.importing.propose import Proposal, standard_form
+from hector_jax.importing.propose import propose as propose_robot
+from hector_jax.importing.remarks import differences, remarks
+from hector_jax.importing.table import changes, section, table_of
 from hector_jax.report.compare import compare_runs, print_comparison
-from hector_jax.robot.importer.propose import Proposal, standard_form
-from hector_jax.robot.importer.propose import propose as propose_robot
-from hector_jax.robot.importer.remarks import differences, remarks
-from hector_jax.robot.importer.table import changes, section, table_of
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import export, nets, searches, tunings
-from hector_jax.runs.folder import RESULT, load_run, read_request
-from hector_jax.runs.setup import Setup
 from hector_jax.search.cmaes import SearchConfig
 from hector_jax.sim import margin
 from hector_jax.sim.engine import choose_engine
+from hector_jax.store import nets, tunings
+from hector_jax.store.folder import RESULT, load_run, read_request
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.loss import alphas, loss_of_robot
+from hector_jax.walk_tuning import searches
 
 
 @singledispatch

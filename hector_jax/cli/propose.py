@@ -19,9 +19,10 @@ from hector_jax.core.files import locked, make_folder, write_json
 from hector_jax.core.inputs import InputError, plural, unknown
 from hector_jax.core.runtime import workers
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import reported_walks, tunings, walk_log, walks
-from hector_jax.runs.campaign import Campaign
-from hector_jax.runs.folder import CONFIG
+from hector_jax.store import tunings
+from hector_jax.store.folder import CONFIG
+from hector_jax.walk_tuning import reported_walks, walk_log, walks
+from hector_jax.walk_tuning.campaign import Campaign
 
 
 def propose(args: Propose) -> None:

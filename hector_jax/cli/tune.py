@@ -34,19 +34,20 @@ from hector_jax.report.report import Picture, print_table
 from hector_jax.report.run import write_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import choice, metrics, nets, tunings, verdicts
-from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, read_object
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.verdicts import ScoredWalks
-from hector_jax.runs.walks import Campaign, Row, candidates, changes, tune_on_walks
 from hector_jax.sim.diagnosis import fall_of
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
+from hector_jax.store import nets, tunings
+from hector_jax.store.folder import CONFIG, METRICS, RESULT, VERSIONS, read_object
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.curvature import Determined, determined
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.evaluate import aligned
+from hector_jax.verdict import choice, judging, metrics
+from hector_jax.verdict.judging import ScoredWalks
+from hector_jax.walk_tuning.walks import Campaign, Row, candidates, changes, tune_on_walks
 
 _ARTEFACTS = "kept"  # folder in it
 
@@ -204,7 +205,7 @@ def _check_start(
     for name, command, seconds in trajectories:
         job = Job(start, command, plant, seconds or Walk.seconds)
         options = {"title": f"walking {name} with the weights to start from", "folder": folder}
-        walks = verdicts.score_jobs(setup, {case: job}, **options, with_walk=[case])
+        walks = judging.score_jobs(setup, {case: job}, **options, with_walk=[case])
         if walks[case][0].score.fallen:
             inputs = setup.config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
             fall = setup.pool.submit(fall_of, *inputs).result() or "fell"
@@ -289,7 +290,7 @@ def _walk_sets(
     """Walk all sets on the stand-in plants and on the hfs; return the walks by trajectory."""
     seeds, description = range(run.args.seeds), run.setup.robot.description
     plants = arguments.plants("standin", seeds, description)
-    judge = partial(verdicts.judge, run.setup, sets, seconds=run.seconds)
+    judge = partial(judging.judge, run.setup, sets, seconds=run.seconds)
     simulator, walks = hfs(description), {}
     for name, command in run.commands.items():
         suffix = f" {name}" if len(run.trajectories) > 1 else ""

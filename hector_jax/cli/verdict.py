@@ -20,11 +20,12 @@ from hector_jax.core.runtime import workers
 from hector_jax.core.settings import SEED
 from hector_jax.report import matrix as report
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import metrics, tunings, verdicts
-from hector_jax.runs.matrix import HEAVY, LIGHT, OWN, Cells, Column
-from hector_jax.runs.setup import Setup
 from hector_jax.sim.engine import Engine, choose_engine
 from hector_jax.sim.loop import Job
+from hector_jax.store import tunings
+from hector_jax.store.setup import Setup
+from hector_jax.verdict import judging, metrics
+from hector_jax.verdict.matrix import HEAVY, LIGHT, OWN, Cells, Column
 
 _ENGINES = get_args(JudgingEngine)[:-1]  # without `all`
 
@@ -177,20 +178,20 @@ def walk_cells(setup: Setup, plan: Plan, folder: Path) -> Cells:
     scored = {}
     for name, engine in plan.engines.items():
         options = {"title": f"walking in {report.TITLES[name]}", "folder": folder, "engine": engine}
-        scored |= verdicts.score_jobs(setup, _jobs(plan, name), **options)
+        scored |= judging.score_jobs(setup, _jobs(plan, name), **options)
     cells = {}
     for column, seeds in plan.columns.items():
         for trajectory, sets in plan.sets.items():
             case, where = (*column, trajectory), report.cell_text((column, trajectory))
             walks = {name: [scored[*case, name, seed][0] for seed in seeds] for name in sets}
-            verdicts.say_faults({f"{name} on {where}": of_set for name, of_set in walks.items()})
+            judging.say_faults({f"{name} on {where}": of_set for name, of_set in walks.items()})
             scores = {name: [walk.score for walk in of_set] for name, of_set in walks.items()}
             by_scene, loss = {trajectory: scores}, setup.config.loss
             cells[column, trajectory] = metrics.make_verdict(loss, seeds, by_scene)
     return cells
 
 
-def _jobs(plan: Plan, engine: str) -> dict[verdicts.Case, Job]:
+def _jobs(plan: Plan, engine: str) -> dict[judging.Case, Job]:
     """Return the walks of an engine."""
     jobs, world = {}, "standin" if plan.family == "standin" else f"standin-{plan.family}"
     for column, seeds in plan.columns.items():

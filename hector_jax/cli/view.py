@@ -14,8 +14,9 @@ from hector_jax.report.plots.style import titled
 from hector_jax.report.report import WORLDS
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import compile_model
-from hector_jax.runs import metrics, nets
-from hector_jax.runs.folder import read_histories, read_request, weights_of
+from hector_jax.store import nets
+from hector_jax.store.folder import read_histories, read_request, weights_of
+from hector_jax.verdict import metrics
 
 
 def view_run(args: View) -> None:

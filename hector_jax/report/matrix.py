@@ -11,10 +11,10 @@ from hector_jax.core.files import write_file, write_json
 from hector_jax.core.inputs import plural
 from hector_jax.report import plots
 from hector_jax.report.report import Picture, change_text, markdown_table, render, seeds_text
-from hector_jax.runs import matrix
-from hector_jax.runs.matrix import OWN, Cells, Column
-from hector_jax.runs.metrics import BASELINES, FEWEST, Interval, compare
 from hector_jax.sim.engine import ENGINES
+from hector_jax.verdict import matrix
+from hector_jax.verdict.matrix import OWN, Cells, Column
+from hector_jax.verdict.metrics import BASELINES, FEWEST, Interval, compare
 
 TITLES = {name: engine.title for name, engine in ENGINES.items()}
 _COARSE = 8  # with fewer plants, intervals are coarse

@@ -14,9 +14,9 @@ import numpy as np
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError
-from hector_jax.runs import walks
-from hector_jax.runs.campaign import Campaign, point_of
 from hector_jax.search.few_walks import Proposal
+from hector_jax.walk_tuning import walks
+from hector_jax.walk_tuning.campaign import Campaign, point_of
 
 
 def read_reports(pool: Executor, campaign: Campaign) -> list[walks.Row]:

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from hector_jax.core.headless import mujoco
+from hector_jax.importing.remarks import numbers, pairs_of, range_words, words_of
+from hector_jax.importing.survey import axis_words
 from hector_jax.robot.checks import standing_data, trunk_body
-from hector_jax.robot.importer.remarks import numbers, pairs_of, range_words, words_of
-from hector_jax.robot.importer.source import build_spec
-from hector_jax.robot.importer.survey import axis_words
 from hector_jax.robot.kinematics import knee_joints
 from hector_jax.robot.model import Robot, build_model
+from hector_jax.robot.source import build_spec
 
 _COLUMNS = {
     "axis": axis_words,

@@ -15,13 +15,13 @@ from hector_jax.core.files import locked
 from hector_jax.core.inputs import plural
 from hector_jax.core.trajectory import SOLVED
 from hector_jax.core.tree_file import tree_hash
-from hector_jax.runs.cache import robot_hash
-from hector_jax.runs.setup import Setup
 from hector_jax.search import cmaes
 from hector_jax.search.cmaes import Generation, SearchConfig, SearchResult, best
 from hector_jax.sim.engine import Engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
+from hector_jax.store.cache import robot_hash
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.loss import loss_of
 
 
@@ -82,7 +82,7 @@ def search(
     size, tune, robot = config.population * len(commands), setup.config, setup.robot
     all_commands = {name: named_command(name) for name in COMMANDS} | dict(commands)
     about = {
-        "code": code_hash("runs.searches", *engine.modules),
+        "code": code_hash("walk_tuning.searches", *engine.modules),
         "engine": engine.key,
         "seconds": tune.rollout.ticks * tune.rollout.walk.gait.tick,
         "controller": repr(tune.rollout.walk),

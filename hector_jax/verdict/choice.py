@@ -19,11 +19,11 @@ from hector_jax.control.weights import Weights
 from hector_jax.core.console import say
 from hector_jax.core.inputs import plural
 from hector_jax.robot.model import Robot
-from hector_jax.runs import verdicts
-from hector_jax.runs.setup import Setup
 from hector_jax.sim.world import Imperfections, hfs_with_motors, noisy
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.loss import smoother
+from hector_jax.verdict import judging
 
 DRAWS = 4  # variations of the model for each command of `best`
 LIMIT, WIDTH, FEEDBACK = 0.19, 7 / 8, 2 / 3
@@ -92,7 +92,7 @@ def walks_best(
         sets: sets by name in the order in which they were made, the start first.
         commands: commands to walk, which count alike.
         count: number of plants.
-        notes: of `verdicts.judge`: `seconds`, `folder` of the scores, which are not walked again,
+        notes: of `judging.judge`: `seconds`, `folder` of the scores, which are not walked again,
             `engine`.
     """
     first, last = next(iter(sets)), next(reversed(sets))
@@ -100,7 +100,7 @@ def walks_best(
         return last
     plants = drawn_plants(setup.robot, count, _FIRST_SEED - count)
     on_plants = f"on {plural(count, 'plant')} drawn around the hfs"
-    judge = partial(verdicts.judge, setup, sets, title=f"choosing `best` {on_plants}", **notes)
+    judge = partial(judging.judge, setup, sets, title=f"choosing `best` {on_plants}", **notes)
     results = [judge(command, plants, range(count)).scores for command in commands]
     logs = {
         name: np.mean([np.log(score.L) for scores in results for score in scores[name]])

@@ -18,11 +18,11 @@ from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.trajectory import FEET
+from hector_jax.importing.survey import MIN_Y, Survey
 from hector_jax.robot.checks import expect
 from hector_jax.robot.description import FEWEST_JOINTS
-from hector_jax.robot.importer.rebuild import SHAPES
-from hector_jax.robot.importer.survey import MIN_Y, Survey
 from hector_jax.robot.links import data_at, subtree
+from hector_jax.robot.rebuild import SHAPES
 
 _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = SHAPES
 _SAME_SOLE = 5e-3  # [m] above the lowest point

@@ -38,10 +38,10 @@ import numpy as np
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import from_table, read_toml
 from hector_jax.core.trajectory import FEET
+from hector_jax.importing.soles import Sole, find_soles
+from hector_jax.importing.stand import standing_pose
+from hector_jax.importing.survey import Survey, survey_file
 from hector_jax.robot.description import MAX_BYTES, Description, Joints, description_of
-from hector_jax.robot.importer.soles import Sole, find_soles
-from hector_jax.robot.importer.stand import standing_pose
-from hector_jax.robot.importer.survey import Survey, survey_file
 from hector_jax.robot.model import Robot, build_model, quiet_mujoco, robot_of
 from hector_jax.robot.response import (
     Response,

@@ -18,18 +18,18 @@ from hector_jax.core.trajectory import SOLVED, State, Trajectory, no_samples
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import Robot
-from hector_jax.runs import metrics
-from hector_jax.runs.cache import content_key, load_or_make
-from hector_jax.runs.setup import Setup
 from hector_jax.sim.diagnosis import fall_of
 from hector_jax.sim.engine import MUJOCO_C, Engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import Imperfections
+from hector_jax.store.cache import content_key, load_or_make
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.rollout import rollout, rollout_config
+from hector_jax.verdict import metrics
 
 # modules that determine the numbers, for `content_key`
-_CODE = ("runs.verdicts", "sim.diagnosis", "runs.metrics")
+_CODE = ("verdict.judging", "sim.diagnosis", "verdict.metrics")
 
 Case = tuple[str | int, ...]
 """Labels of a walk, the last the seed of its plant."""

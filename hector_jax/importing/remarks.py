@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hector_jax.core.headless import mujoco
-from hector_jax.robot.importer.source import Source, build_spec
 from hector_jax.robot.links import data_at
 from hector_jax.robot.model import Robot, build_model
+from hector_jax.robot.source import Source, build_spec
 
 _HEAVY_LEGS = 0.35  # share of the robot's mass
 _UNLIKE = 0.05  # least relative difference of the legs of a pair that is told

@@ -36,19 +36,33 @@ from hector_jax.core.settings import read_json
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
 from hector_jax.grfm import network
-from hector_jax.runs import tunings
-from hector_jax.runs.cache import content_key, robot_hash
-from hector_jax.runs.campaign import Campaign, box_of, matrix_of, slope_of, walker_hash, weights_at
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.walk_log import Log, ScoredLog, evaluate_log, log_of, read_log, trajectory_of
 from hector_jax.search import few_walks
 from hector_jax.search.cmaes import add_row, read_journal
 from hector_jax.search.few_walks import Model, Proposal, Space, WalkResult
 from hector_jax.sim.loop import Job
+from hector_jax.store import tunings
+from hector_jax.store.cache import content_key, robot_hash
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig, step_status
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.grounded import Grounding, evaluate_grounded, fit_grounding, grounded_matrix
 from hector_jax.tuning.status import StepStatus
+from hector_jax.walk_tuning.campaign import (
+    Campaign,
+    box_of,
+    matrix_of,
+    slope_of,
+    walker_hash,
+    weights_at,
+)
+from hector_jax.walk_tuning.walk_log import (
+    Log,
+    ScoredLog,
+    evaluate_log,
+    log_of,
+    read_log,
+    trajectory_of,
+)
 
 RECORD = "walks.jsonl"
 
@@ -149,7 +163,7 @@ def read_history(campaign: Campaign) -> list[Row]:
         hint = f" and begin anew with hector propose --start {campaign.folder}/weights/N.json"
     else:
         head |= {"methods": list(campaign.methods), "grounded": campaign.grounded}
-        head |= {"engine": engine.key, "code": code_hash("runs.walks", *engine.modules)}
+        head |= {"engine": engine.key, "code": code_hash("walk_tuning.walks", *engine.modules)}
 
     def parse(row: Mapping[str, Any]) -> Row:
         point, losses = np.array(row["point"], float), np.array(row["losses"], float)

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hector_jax.runs import metrics
-from hector_jax.runs.metrics import BASELINES, COVERAGE, Comparison, Interval, Verdict
+from hector_jax.verdict import metrics
+from hector_jax.verdict.metrics import BASELINES, COVERAGE, Comparison, Interval, Verdict
 
 OWN, LIGHT, HEAVY = "own", "light", "heavy"  # models: the robot's file, and with other masses
 FEWEST_SETS = 3  # for which Kendall's tau is computed

@@ -24,8 +24,7 @@ from hector_jax.core.files import make_folder, write_file, write_json
 from hector_jax.core.inputs import InputError, plural, unknown
 from hector_jax.core.settings import Range, from_table, read_json, to_table
 from hector_jax.core.tree_file import tree_hash
-from hector_jax.robot.model import Robot
-from hector_jax.runs.export_controller import (
+from hector_jax.export.controller import (
     Check,
     as_arrays,
     check,
@@ -35,8 +34,9 @@ from hector_jax.runs.export_controller import (
     record,
     signature,
 )
-from hector_jax.runs.folder import CONFIG
+from hector_jax.robot.model import Robot
 from hector_jax.sim.loop import substeps
+from hector_jax.store.folder import CONFIG
 
 SCHEMA = "weights.schema.json"
 PLATFORMS = ("cpu", "cuda")

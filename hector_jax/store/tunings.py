@@ -26,13 +26,13 @@ from hector_jax.core.tree import stack
 from hector_jax.grfm import network
 from hector_jax.grfm.nets import member
 from hector_jax.robot.model import Robot
-from hector_jax.runs.cache import content_key, load_or_make
-from hector_jax.runs.folder import add_iteration, write_histories
-from hector_jax.runs.setup import Setup
 from hector_jax.sim.diagnosis import not_the_weights
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
+from hector_jax.store.cache import content_key, load_or_make
+from hector_jax.store.folder import add_iteration, write_histories
+from hector_jax.store.setup import Setup
 from hector_jax.tuning import batch, difftune, evaluate
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning, step_status
 from hector_jax.tuning.evaluate import Objective, mean_objective
@@ -41,7 +41,7 @@ from hector_jax.tuning.rollout import drawn_variation, rollout_config
 from hector_jax.tuning.status import StepStatus
 
 # modules that determine the numbers, for `content_key`
-TUNING_CODE = ("runs.tunings", "tuning.difftune", "grfm.network")
+TUNING_CODE = ("store.tunings", "tuning.difftune", "grfm.network")
 
 
 class Problem(NamedTuple):

@@ -21,10 +21,10 @@ from jaxtyping import Float
 from hector_jax.core.headless import mujoco
 from hector_jax.robot.checks import expect, require
 from hector_jax.robot.description import FEWEST_JOINTS, MOST_JOINTS
-from hector_jax.robot.importer.elements import spec_of
-from hector_jax.robot.importer.source import compile_bare
+from hector_jax.robot.elements import spec_of
 from hector_jax.robot.links import data_at, subtree
 from hector_jax.robot.mjcf import read_mjcf
+from hector_jax.robot.source import compile_bare
 
 _HINGE, _FREE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
 _MIRROR_TOLERANCE = 0.03  # [m] between a joint and the mirror image of the other leg's

@@ -27,13 +27,13 @@ from hector_jax.grfm.network import Params, as_effect
 from hector_jax.grfm.paper import LinearMap, fit_linear
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import Robot
-from hector_jax.runs.cache import content_key, robot_hash
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.tunings import TUNING_CODE, compile_programs, tune_config, tuning_paths
 from hector_jax.sim.engine import ENGINES, choose_engine
+from hector_jax.store.cache import content_key, robot_hash
+from hector_jax.store.setup import Setup
+from hector_jax.store.tunings import TUNING_CODE, compile_programs, tune_config, tuning_paths
 
 # modules that determine the numbers, for `code_hash`
-TRAINING_CODE = ("runs.nets", "grfm.training")
+TRAINING_CODE = ("store.nets", "grfm.training")
 COLLECTION_CODE = (*TUNING_CODE, "grfm.collection", "grfm.jobs", "sim.walk", "sim.parallel")
 
 

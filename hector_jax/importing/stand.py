@@ -17,8 +17,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from hector_jax.core.headless import mujoco
-from hector_jax.robot.importer.soles import Sole
-from hector_jax.robot.importer.survey import Survey
+from hector_jax.importing.soles import Sole
+from hector_jax.importing.survey import Survey
 from hector_jax.robot.links import data_at
 
 KNEE = 1.0  # [rad] of the first trial

@@ -19,10 +19,10 @@ from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import did_you_mean
 from hector_jax.robot.checks import ON_FLOOR, expect, listed, lowest_points, require
 from hector_jax.robot.description import Description
-from hector_jax.robot.importer.elements import spec_of
-from hector_jax.robot.importer.rebuild import SHAPES, SOLVER, Pieces, contact_bits, rebuild
+from hector_jax.robot.elements import spec_of
 from hector_jax.robot.links import MASSLESS, Link, data_at, links_of
 from hector_jax.robot.mjcf import mujoco_errors, read_mjcf
+from hector_jax.robot.rebuild import SHAPES, SOLVER, Pieces, contact_bits, rebuild
 
 _JOINT = mujoco.mjtJoint
 _MOTOR = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE

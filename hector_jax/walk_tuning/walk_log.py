@@ -17,9 +17,9 @@ from hector_jax.core.trajectory import SOLVED, State, Trajectory, Wrench, has_fa
 from hector_jax.core.tree_file import named_leaves, read_card, tree_hash
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
-from hector_jax.runs.campaign import walker_hash
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import loss_of
+from hector_jax.walk_tuning.campaign import walker_hash
 
 
 class Log(NamedTuple):
