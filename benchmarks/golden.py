@@ -54,7 +54,7 @@ from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs, ideal
 from hector_jax.tuning.difftune import TuneConfig, tune, tune_step
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
-from hector_jax.tuning.rollout import RolloutConfig, no_variation, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, no_variation, rollout
 
 ROOT = Path(__file__).parents[1]
 STRIDER = ROOT / "examples" / "strider" / "robot.toml"
@@ -167,48 +167,51 @@ def rollouts() -> Arrays:
     config = TuneConfig()
     for model, effect in models.items():
         for command in COMMANDS if model == "plain" else ("s",):
-            known = named_command(command), standing_anchor(robot), effect
-            seen = tune_step(config, robot, nominal(), *known)
+            scenario = Scenario(robot, named_command(command), standing_anchor(robot), effect)
+            seen = tune_step(config, scenario, nominal())
             found[f"{model}, {command}"] = _flat(
                 [seen.loss, [seen.terms[term.name] for term in config.loss], seen.gradient]
             )
     short = TuneConfig(rollout=RolloutConfig(ticks=50))
-    known = robot, nominal(), named_command("s"), standing_anchor(robot), last_command
+    scenario = Scenario(robot, named_command("s"), standing_anchor(robot), last_command)
     for name, walking in controllers().items():
         if name not in ("default", "leg weight"):
             optional = replace(short, rollout=RolloutConfig(walk=walking, ticks=50))
-            seen = tune_step(optional, *known)
+            seen = tune_step(optional, scenario, nominal())
             found[name] = _flat([seen.loss, seen.gradient])
     lead = replace(short, rollout=RolloutConfig(ticks=50, lead=20, block=40))
-    found["lead"] = _flat(tune_step(lead, *known).gradient)
-    walked, columns = jax.jit(sensitivity.propagate, static_argnums=0)(short.rollout, *known)
-    found["forward recursion"] = _flat(sensitivity.gradient(PAPER_LOSS, walked, columns, known[1]))
+    found["lead"] = _flat(tune_step(lead, scenario, nominal()).gradient)
+    walked, columns = jax.jit(sensitivity.propagate, static_argnums=0)(
+        short.rollout, scenario, nominal()
+    )
+    found["forward recursion"] = _flat(sensitivity.gradient(PAPER_LOSS, walked, columns, nominal()))
     noise = State(*(np.full(3, 1e-3) for _ in range(4)))
     varied = no_variation()._replace(
         mass=np.asarray(1.1), friction=np.asarray(0.4), delay=np.asarray(0.004), noise=noise
     )
-    varied = jax.tree.map(jnp.asarray, varied)
+    varied = scenario._replace(variation=jax.tree.map(jnp.asarray, varied))
     found["variation"] = _flat(
-        jax.jit(rollout, static_argnums=0)(short.rollout, *known, varied).state
+        jax.jit(rollout, static_argnums=0)(short.rollout, varied, nominal()).state
     )
     other = load_robot(STRIDER)
     config = TuneConfig(rollout=RolloutConfig(walk=walk_config(other), ticks=50))
-    known = other, nominal(other), named_command("s"), standing_anchor(other), last_command
-    seen = tune_step(config, *known)
+    scenario = Scenario(other, named_command("s"), standing_anchor(other), last_command)
+    seen = tune_step(config, scenario, nominal(other))
     return found | {"strider": _flat([seen.loss, seen.gradient])}
 
 
 def tunings() -> Arrays:
     """Ten iterations with each rule."""
     robot, found = load_robot(), {}
-    known = robot, nominal(), named_command("s"), standing_anchor(robot)
+    effect = effect_of(None, WalkConfig())
+    scenario = Scenario(robot, named_command("s"), standing_anchor(robot), effect)
     rules = {
         "gauss_newton": TuneConfig(),
         "relative": TuneConfig(rule="relative"),
         "literal": TuneConfig(rule="literal", beta_q=1e-5, beta_r=1e-17),
     }
     for name, config in rules.items():
-        ended = tune(config, *known, effect_of(None, WalkConfig()))
+        ended = tune(config, scenario, nominal())
         found[f"{name}, L"] = [float(one.evaluation.loss) for one in ended.iterations]
         found[f"{name}, weights"] = np.asarray(weights_to_vector(ended.weights))
     return found

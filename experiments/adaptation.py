@@ -41,7 +41,7 @@ from hector_jax.tuning.difftune import Iteration, TuneConfig, TuneState, trial_w
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.grounded import MeasuredState, carry_from
 from hector_jax.tuning.loss import Loss, losses
-from hector_jax.tuning.rollout import Carry, RolloutConfig, command_history
+from hector_jax.tuning.rollout import Carry, RolloutConfig, Scenario, command_history
 
 ESTIMATORS = ("carried", "cut", "model")
 
@@ -127,13 +127,14 @@ def window_derivatives(
         if measured:
             carry = carry_from(begin, anchor, carry.commands, carry.disturbance)
         after, tangents, sample, columns = step_sensitivities(
-            config, robot, weights, command, effect, carry, tangents, tick
+            config, scenario, weights, carry, tangents, tick
         )
         if measured:
             fallen = has_fallen(end.state, *robot.description.limits)
             sample = sample._replace(state=end.state, fallen=fallen)
         return (after, tangents), (sample, columns)
 
+    scenario = Scenario(robot, command, anchor, effect)
     begins, ends = jax.tree.map(lambda x: x[:-1], states), jax.tree.map(lambda x: x[1:], states)
     state, newest = jax.tree.map(lambda x: x[0], states), jax.tree.map(lambda x: x[-1], weights)
     carry = carry_from(state, anchor, trace.commands, trace.disturbance)

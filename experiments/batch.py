@@ -41,7 +41,7 @@ from hector_jax.robot.model import Robot, load_robot
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections, hfs, hfs_varied
 from hector_jax.store.setup import Setup
-from hector_jax.tuning.batch import Problem, Scenario, tail_weights, tune_batch
+from hector_jax.tuning.batch import BatchProblem, BatchScenario, tail_weights, tune_batch
 from hector_jax.tuning.difftune import TuneConfig, Tuning, single
 from hector_jax.tuning.loss import PAPER_LOSS, Terms, with_alphas
 from hector_jax.tuning.rollout import Variation, no_variation
@@ -126,7 +126,7 @@ def tune(
     flags: Flags,
     robot: Robot,
     effects: Any,
-    problems: Sequence[Problem],
+    problems: Sequence[BatchProblem],
     title: str,
     nominal_rows: slice = slice(None),
 ) -> Tuning:
@@ -159,16 +159,16 @@ def scenario(
     scale: float = 1.0,
     effect: int = 0,
     variation: Variation | None = None,
-) -> Scenario:
+) -> BatchScenario:
     """Return a walk from standing, with the paper's weights of tracking times `tracking`."""
     loss = with_alphas({t.name: tracking * t.weight for t in PAPER_LOSS[:2]})
     anchor, index = standing_anchor(robot), np.asarray(effect)
-    return Scenario(command, anchor, index, loss, np.asarray(scale), variation)
+    return BatchScenario(command, anchor, index, loss, np.asarray(scale), variation)
 
 
-def problem(start: Weights, scenarios: Sequence[Scenario], tail: float = 1.0) -> Problem:
+def problem(start: Weights, scenarios: Sequence[BatchScenario], tail: float = 1.0) -> BatchProblem:
     """Return the problem of tuning a weight set on scenarios."""
-    return Problem(start, stack(scenarios), np.asarray(tail))
+    return BatchProblem(start, stack(scenarios), np.asarray(tail))
 
 
 def first_host() -> bool:

@@ -33,7 +33,7 @@ from lib import check_names, write_report
 from rivals import LEARN, READ_START, RIVALS, Spent, Task
 from scipy.stats import t as student
 
-from hector_jax.control.reference import Command, named_command, standing_anchor
+from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.arrays import Array
@@ -55,7 +55,7 @@ from hector_jax.store import tunings
 from hector_jax.store.cache import content_key
 from hector_jax.store.setup import Setup
 from hector_jax.tuning.loss import Loss, loss_of
-from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.verdict import judging
 from hector_jax.walk_tuning import walks
 from hector_jax.walk_tuning.campaign import Campaign, box_of, weights_at
@@ -158,17 +158,19 @@ def search_job(campaign: Campaign, seed: int) -> tuple[np.ndarray, np.ndarray]:
     identity = np.eye(len(box))
     space = Space(identity, identity, np.zeros(len(box)), box_of(campaign))
     config = campaign.config.rollout
-    inputs = config, campaign.robot, command, effect_of(None, config.walk), campaign.config.loss
-    at_start = float(np.log(_model_loss(*inputs, campaign.start)))
+    anchor, effect = standing_anchor(campaign.robot), effect_of(None, config.walk)
+    scenario, loss = Scenario(campaign.robot, command, anchor, effect), campaign.config.loss
+    at_start = float(np.log(_model_loss(config, scenario, loss, campaign.start)))
     points: list[np.ndarray] = []
     losses: list[float] = []
 
     def walk(point: Float[np.ndarray, " n"]) -> float:
         if len(losses) == SOURCES:
             raise Spent
-        loss = float(np.log(_model_loss(*inputs, weights_at(campaign, space, point)))) - at_start
+        found = _model_loss(config, scenario, loss, weights_at(campaign, space, point))
+        change = float(np.log(found)) - at_start
         points.append(point)
-        losses.append(loss if np.isfinite(loss) else max(losses, default=0.0) + 1.0)
+        losses.append(change if np.isfinite(change) else max(losses, default=0.0) + 1.0)
         return losses[-1]
 
     nothing = np.zeros((0, len(box))), np.zeros(0)
@@ -178,15 +180,8 @@ def search_job(campaign: Campaign, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @partial(jax.jit, static_argnums=0)
-def _model_loss(
-    config: RolloutConfig,
-    robot: Robot,
-    command: Command,
-    effect: jax.tree_util.Partial,
-    loss: Loss,
-    weights: Weights,
-) -> Array:
-    return loss_of(loss, rollout(config, robot, weights, command, standing_anchor(robot), effect))
+def _model_loss(config: RolloutConfig, scenario: Scenario, loss: Loss, weights: Weights) -> Array:
+    return loss_of(loss, rollout(config, scenario, weights))
 
 
 def _box(campaign: Campaign) -> Float[np.ndarray, "n 2"]:

@@ -81,8 +81,9 @@ def _(primals, tangents):
 step_carry = rollout.step_carry
 
 
-def planted(config, robot, weights, command, effect, carry, tick, variation=None):
+def planted(config, scenario, weights, carry, tick, *, wrench=None):
     """`step_carry` with the fault that the command names."""
+    command = scenario.command
     flat = [weights_to_vector(w) for w in (weights, nominal())]
     far = jnp.max(jnp.abs(jnp.log(flat[0] / flat[1]))) > command.velocity[1, 1]
     now = far & (tick == command.velocity[1, 0])
@@ -96,7 +97,7 @@ def planted(config, robot, weights, command, effect, carry, tick, variation=None
     weights = weights._replace(R=weights.R._replace(force=curved))
     # a QP without a price, solved by any wrench
     weights = jax.tree.map(lambda w: jnp.where(is_now(Fault.FLAT), 0.0, w), weights)
-    return step_carry(config, robot, weights, walked, effect, carry, tick, variation)
+    return step_carry(config, scenario._replace(command=walked), weights, carry, tick)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -19,7 +19,7 @@ from hector_jax.robot.model import load_robot
 from hector_jax.store.folder import as_line
 from hector_jax.tuning.difftune import TuneConfig, tune
 from hector_jax.tuning.loss import PAPER_LOSS, LossTerm, losses, switch_loss, total, with_alphas
-from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.rollout import RolloutConfig, Scenario
 from hector_jax.verdict import metrics
 
 NAMES = ["L_Eul", "L_pos", "L_ctrl"]
@@ -181,9 +181,8 @@ def test_a_fourth_term_is_tuned_told_and_written_from_one_place():
     loss = (*PAPER_LOSS, LossTerm("L_sway", "m^2/s^2", 1e4, sway_loss))
     config = TuneConfig(rollout=RolloutConfig(ticks=20), loss=loss, iterations=1)
     robot = load_robot()
-    tuning = tune(
-        config, robot, nominal(), named_command("s"), standing_anchor(robot), last_command
-    )
+    scenario = Scenario(robot, named_command("s"), standing_anchor(robot), last_command)
+    tuning = tune(config, scenario, nominal())
     first = tuning.iterations[0]
     terms = first.evaluation.terms
     assert terms["L_sway"] > 0.0

@@ -6,7 +6,7 @@ import pytest
 from measured import evaluate_walk, tune_measured
 from model import AHEAD, BRIEF, PLAIN
 
-from hector_jax.control.reference import named_command
+from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import directions, nominal, weights_to_vector
 from hector_jax.core.trajectory import State, Wrench, no_samples
 from hector_jax.grfm.effect import last_command
@@ -23,9 +23,13 @@ from hector_jax.tuning.grounded import (
     grounded_rollout,
 )
 from hector_jax.tuning.loss import PAPER_LOSS
-from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.rollout import RolloutConfig, Scenario
 
 CONFIG, WALKED = TuneConfig(rollout=BRIEF), (AHEAD, PLAIN)
+
+
+def scenario(robot):
+    return Scenario(robot, AHEAD, standing_anchor(robot), PLAIN)
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +136,7 @@ def test_a_walk_in_mujoco_gives_a_slope_that_leads_down(robot):
 
 
 def test_with_the_weights_that_were_walked_a_grounded_rollout_is_the_walk(robot, measured):
-    missed = fit_grounding(BRIEF, robot, nominal(), *WALKED, measured)
+    missed = fit_grounding(BRIEF, scenario(robot), nominal(), measured)
     again = jax.jit(grounded_rollout, static_argnums=0)(BRIEF, missed, nominal())
     for found, there in zip(again.state, measured.state, strict=True):
         np.testing.assert_allclose(found, there[1:], atol=1e-12)
@@ -140,7 +144,7 @@ def test_with_the_weights_that_were_walked_a_grounded_rollout_is_the_walk(robot,
 
 
 def test_its_gradient_is_that_along_the_walk_by_forward_recursion(robot, measured):
-    missed = fit_grounding(BRIEF, robot, nominal(), *WALKED, measured)
+    missed = fit_grounding(BRIEF, scenario(robot), nominal(), measured)
     # that one prices the change from the command before its first tick too
     tracking = tuple(t._replace(weight=t.weight * (t.name != "L_ctrl")) for t in PAPER_LOSS)
     found = evaluate_grounded(BRIEF, missed, nominal(), tracking)
@@ -151,7 +155,7 @@ def test_its_gradient_is_that_along_the_walk_by_forward_recursion(robot, measure
 
 
 def test_the_matrix_of_a_grounded_rollout_has_a_row_for_each_tuned_number(robot, measured):
-    missed = fit_grounding(BRIEF, robot, nominal(), *WALKED, measured)
+    missed = fit_grounding(BRIEF, scenario(robot), nominal(), measured)
     weights = BRIEF.walk.with_others(nominal(), ["turn_lead"])
     matrix = grounded_matrix(BRIEF, missed, weights, PAPER_LOSS, ("turn_lead",))
     assert matrix.shape == (19, 19)
@@ -160,4 +164,4 @@ def test_the_matrix_of_a_grounded_rollout_has_a_row_for_each_tuned_number(robot,
 
 def test_a_walk_of_another_length_is_refused(robot, measured):
     with pytest.raises(ValueError, match="different leading axis sizes"):
-        fit_grounding(RolloutConfig(ticks=4), robot, nominal(), *WALKED, measured)
+        fit_grounding(RolloutConfig(ticks=4), scenario(robot), nominal(), measured)

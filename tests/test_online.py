@@ -29,10 +29,11 @@ from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.grounded import MeasuredState
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
-from hector_jax.tuning.rollout import init_carry, step_carry
+from hector_jax.tuning.rollout import Scenario, init_carry, step_carry
 
 ROBOT, TUNE, S = load_robot(), TuneConfig(), named_command("s")
 ANCHOR = standing_anchor(ROBOT)
+SCENARIO = Scenario(ROBOT, S, ANCHOR, last_command)
 TICKS = 16  # two windows of 8, with a change of stance in the first; begun as many ticks late
 
 
@@ -56,7 +57,7 @@ def ahead(theta, carry, start):
 
     def one(now, tick):
         weights = vector_to_weights(theta)
-        after, sample = step_carry(TUNE.rollout, ROBOT, weights, S, last_command, now, tick)
+        after, sample = step_carry(TUNE.rollout, SCENARIO, weights, now, tick)
         return after, (now, sample)
 
     last, (carries, samples) = jax.lax.scan(one, carry, start + jnp.arange(TICKS))
@@ -69,7 +70,7 @@ def ahead(theta, carry, start):
 @pytest.fixture(scope="module")
 def begin():
     """What the rigid body hands on after as many ticks, before a change of stance."""
-    return ahead(vector(nominal()), init_carry(ROBOT, ANCHOR), 0)[1]
+    return ahead(vector(nominal()), init_carry(SCENARIO), 0)[1]
 
 
 @pytest.fixture(scope="module")

@@ -41,7 +41,7 @@ from hector_jax.store.nets import CollectConfig
 from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import Evaluation, mean_objective
-from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.rollout import RolloutConfig, Scenario
 from hector_jax.verdict.metrics import score
 from hector_jax.walk_tuning import searches
 
@@ -201,17 +201,17 @@ def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, m
     sizes = {"c": 1.0, "s": 1e3}
     commands = [named_command(name)._replace(duration=np.array([k])) for name, k in sizes.items()]
 
-    def tune_step(config, robot, weights, command, anchor, effect, variation=None):
+    def tune_step(config, scenario, weights):
         vector = np.asarray(weights_to_vector(weights))
-        (size,) = command.duration
+        (size,) = scenario.command.duration
         logs = np.log(vector) - (1.0 if size > 1.0 else -1.0)
         gradient = vector_to_weights(jnp.asarray(2.0 * size * logs / vector))
         loss = np.array(size * (logs @ logs))
         terms = dict.fromkeys(("L_Eul", "L_pos", "L_ctrl"), loss)
         return Evaluation(loss, terms, gradient, np.array(0.0), np.array(0.0))
 
-    def matrix(config, robot, weights, command, **model):
-        return 2.0 * float(command.duration[0]) * SHARED
+    def matrix(config, scenario, weights, loss, *, others):
+        return 2.0 * float(scenario.command.duration[0]) * SHARED
 
     monkeypatch.setattr(tunings.difftune, "tune_step", tune_step)
     monkeypatch.setattr(tunings.difftune, "gauss_newton_jit", matrix)
@@ -221,7 +221,8 @@ def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, m
         problem = tunings.Problem((commands[0], *others), None)
         found = tunings._tune_on_cpu(setup, nominal(), problem, lambda iteration: None)
         first = found.iterations[0].evaluation
-        each = [tune_step(None, None, nominal(), c, None, None) for c in (commands[0], *others)]
+        scenarios = [Scenario(robot, c, None, None) for c in (commands[0], *others)]
+        each = [tune_step(config, scenario, nominal()) for scenario in scenarios]
         mean = np.mean([one.loss for one in each])
         assert first.loss == pytest.approx(mean, rel=1e-12)
         scales = [one.loss / mean for one in each]
@@ -238,8 +239,8 @@ def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, m
 
 @pytest.mark.parametrize("falls", [{1}, {0, 1, 2}])
 def test_drawn_models_with_which_the_start_falls_are_left_out(robot, monkeypatch, capsys, falls):
-    def tune_step(config, robot, weights, command, anchor, effect, variation):
-        seed = int(variation.seed)
+    def tune_step(config, scenario, weights):
+        seed = int(scenario.variation.seed)
         loss, fallen = np.array(1.0 + seed), np.array(float(seed in falls))
         return Evaluation(loss, {}, nominal(), fallen, np.array(0.0))
 

@@ -52,7 +52,7 @@ from hector_jax.robot.model import load_robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs, ideal
-from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.verdict import judging
 
 FILE = Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml"
@@ -246,11 +246,9 @@ def test_point_feet_have_weights_of_forces_alone(tmp_path):
 def data():
     """Samples of two walks on the rigid body whose ground answers a little less than commanded."""
     config = RolloutConfig(walk=CONFIG, ticks=60, lead=10)
-    walk_ = jax.jit(partial(rollout, config, ROBOT))
-    walks = [
-        walk_(weights, named_command("s"), ANCHOR, last_command)
-        for weights in (nominal(ROBOT), expert(ROBOT))
-    ]
+    scenario = Scenario(ROBOT, named_command("s"), ANCHOR, last_command)
+    walk_ = jax.jit(partial(rollout, config, scenario))
+    walks = [walk_(weights) for weights in (nominal(ROBOT), expert(ROBOT))]
     walks = jax.tree.map(lambda *x: np.stack(x), *walks)
     rng = np.random.default_rng(0)
     push = lambda x: 0.9 * x + rng.normal(size=x.shape)  # noqa: E731

@@ -22,6 +22,7 @@ from hector_jax.tuning.evaluate import evaluate_jit, gradient_norms
 from hector_jax.tuning.loss import PAPER_LOSS
 from hector_jax.tuning.rollout import (
     RolloutConfig,
+    Scenario,
     _estimate_error,
     _moved_by,
     _within_friction,
@@ -62,7 +63,8 @@ def assert_same(one, other):
 def moved(variation, now, before=None, feet_before=FEET):
     before = now if before is None else before
     now, before = ground_effect(now), ground_effect(before)
-    return _moved_by(variation, ROBOT, tilted(), now, FEET, before, feet_before, DT)
+    before = before, feet_before
+    return _moved_by(variation, ROBOT, tilted(), dt=DT, now=(now, FEET), before=before)
 
 
 def test_without_a_variation_the_body_moves_as_the_rigid_body():
@@ -91,10 +93,10 @@ def test_a_force_through_the_true_centre_of_mass_does_not_turn_the_body():
     up = Wrench(jnp.zeros((2, 3)).at[0, 2].set(50.0), jnp.zeros((2, 3)))
     under = jnp.array([[0.01, -0.02, -0.4]] * 2)
     variation = no_variation()._replace(com=offset)
-    now = ground_effect(up)
-    found = _moved_by(variation, ROBOT, state, now, under, now, under, DT)
+    now = ground_effect(up), under
+    found = _moved_by(variation, ROBOT, state, dt=DT, now=now, before=now)
     np.testing.assert_allclose(found.ang_velocity, 0.0, atol=1e-12)
-    beside = _moved_by(no_variation(), ROBOT, state, now, under, now, under, DT)
+    beside = _moved_by(no_variation(), ROBOT, state, dt=DT, now=now, before=now)
     assert np.abs(beside.ang_velocity).max() > 1e-3
 
 
@@ -145,13 +147,17 @@ def test_friction_has_a_slope_where_no_foot_carries_anything():
 @pytest.mark.slow  # compiles two rollouts
 def test_a_walk_in_a_world_that_is_as_believed_is_the_plain_one():
     config, anchor = RolloutConfig(ticks=40), standing_anchor(ROBOT)
-    arguments = config, ROBOT, nominal(), named_command("s"), anchor, last_command
-    plain, same = walk(*arguments), walk(*arguments, no_variation())
+    scenario = Scenario(ROBOT, named_command("s"), anchor, last_command)
+    plain, same = (
+        walk(config, scenario._replace(variation=variation), nominal())
+        for variation in (None, no_variation())
+    )
     np.testing.assert_allclose(same.state.position, plain.state.position, atol=1e-9)
     noise = State(*(jnp.full(3, 5e-3) for _ in range(4)))
     noisy = [
-        walk(*arguments, no_variation()._replace(noise=noise, seed=jnp.asarray(seed)))
+        walk(config, scenario._replace(variation=variation), nominal())
         for seed in (1, 1, 2)
+        for variation in [no_variation()._replace(noise=noise, seed=jnp.asarray(seed))]
     ]
     np.testing.assert_array_equal(noisy[0].state.position, noisy[1].state.position)
     apart = [np.abs(w.state.position - plain.state.position).max() for w in noisy[1:]]
@@ -183,18 +189,17 @@ def test_a_delay_of_more_than_a_tick_is_refused():
 def test_a_tuning_sees_the_noise_and_the_delay_of_the_description():
     robot = robot_with(estimate_noise=1.0, delay=0.005)
     config = rollout_config(robot, ticks=10)
-    inputs = nominal(), named_command("straight"), standing_anchor(ROBOT), last_command
-    seen = tune_step(TuneConfig(rollout=config), robot, *inputs)
-    expected = evaluate_jit(
-        RolloutConfig(ticks=10), robot, *inputs, PAPER_LOSS, variation_of(config)
-    )
-    assert_same(seen, expected)
-    plain = evaluate_jit(config, robot, *inputs, PAPER_LOSS, no_variation())
+    scenario = Scenario(robot, named_command("straight"), standing_anchor(ROBOT), last_command)
+    seen = tune_step(TuneConfig(rollout=config), scenario, nominal())
+    told = scenario._replace(variation=variation_of(config))
+    assert_same(seen, evaluate_jit(RolloutConfig(ticks=10), told, nominal(), PAPER_LOSS))
+    none = scenario._replace(variation=no_variation())
+    plain = evaluate_jit(config, none, nominal(), PAPER_LOSS)
     assert abs(seen.loss / plain.loss - 1.0) > 1e-3
     single = tuple(t._replace(weight=float(t.name == "L_ctrl")) for t in PAPER_LOSS)
-    slope = evaluate_jit(config, robot, *inputs, single).gradient
+    slope = evaluate_jit(config, scenario, nominal(), single).gradient
     logs = weights_to_vector(jax.tree.map(jnp.multiply, slope, nominal()))
-    norms = gradient_norms(config, robot, *inputs, PAPER_LOSS)
+    norms = gradient_norms(config, scenario, nominal(), PAPER_LOSS)
     assert norms["L_ctrl"] == pytest.approx(np.linalg.norm(logs))
 
 
@@ -203,9 +208,13 @@ def test_the_curvature_of_a_tuning_has_its_noise():
     robot = robot_with(estimate_noise=1.0, delay=0.005)
     config = rollout_config(robot, ticks=10)
     effect = effect_of(None, config.walk)
-    model = nominal(), named_command("straight"), standing_anchor(robot), effect, PAPER_LOSS
-    seen = gauss_newton_jit(config, robot, *model)
-    expected = gauss_newton_jit(RolloutConfig(ticks=10), robot, *model, variation_of(config))
-    plain = gauss_newton_jit(config, robot, *model, no_variation())
+    scenario = Scenario(robot, named_command("straight"), standing_anchor(robot), effect)
+
+    def matrix(config, variation=None):
+        varied = scenario._replace(variation=variation)
+        return gauss_newton_jit(config, varied, nominal(), PAPER_LOSS)
+
+    seen, plain = matrix(config), matrix(config, no_variation())
+    expected = matrix(RolloutConfig(ticks=10), variation_of(config))
     np.testing.assert_allclose(seen, expected, rtol=1e-9)
     assert np.abs(seen / plain - 1.0).max() > 1e-3

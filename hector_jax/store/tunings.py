@@ -37,7 +37,7 @@ from hector_jax.tuning import batch, difftune, evaluate
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning, step_status
 from hector_jax.tuning.evaluate import Objective, mean_objective
 from hector_jax.tuning.loss import loss_of_robot
-from hector_jax.tuning.rollout import drawn_variation, rollout_config
+from hector_jax.tuning.rollout import Scenario, drawn_variation, rollout_config
 from hector_jax.tuning.status import StepStatus
 
 # modules that determine the numbers, for `content_key`
@@ -71,44 +71,44 @@ def artefact(setup: Setup, start: Weights) -> dict[str, Any]:
     return {"like": lambda _: like, "kind": "tuning", "robot": setup.robot}
 
 
-def _scenarios(config: TuneConfig, robot: Robot, problem: Problem) -> list[dict[str, Any]]:
-    """Return command, anchor, effect and variation of each rollout of a problem.
+def _scenarios(config: TuneConfig, robot: Robot, problem: Problem) -> list[Scenario]:
+    """Return the rollouts of a problem.
 
     A drawn one starts at the touchdown of a foot or half a cycle later, and its net is one member.
     """
     commands, params, draws = problem
     walk = config.rollout.walk
     if not draws:
-        model = {"anchor": standing_anchor(robot), "effect": network.effect_of(params, walk)}
-        return [{"command": command, **model} for command in commands]
+        anchor, effect = standing_anchor(robot), network.effect_of(params, walk)
+        return [Scenario(robot, command, anchor, effect) for command in commands]
     scenarios = []
     for seed, command in enumerate(command for command in commands for _ in range(draws)):
         net = params if params is None else member(params, seed)
         tick = seed % 2 * (walk.gait.cycle // 2)
-        scenario = {"anchor": standing_anchor(robot, tick), "effect": network.effect_of(net, walk)}
+        anchor, effect = standing_anchor(robot, tick), network.effect_of(net, walk)
         variation = drawn_variation(config.rollout, robot, seed)
-        scenarios.append({"command": command, **scenario, "variation": variation})
+        scenarios.append(Scenario(robot, command, anchor, effect, variation))
     return scenarios
 
 
 def _evaluation_job(
-    config: TuneConfig, robot: Robot, weights: Weights, scenario: dict[str, Any]
+    config: TuneConfig, scenario: Scenario, weights: Weights
 ) -> evaluate.Evaluation:
-    return jax.device_get(difftune.tune_step(config, robot, weights, **scenario))
+    return jax.device_get(difftune.tune_step(config, scenario, weights))
 
 
 def _matrix_job(
-    config: TuneConfig, robot: Robot, weights: Weights, scenario: dict[str, Any]
+    config: TuneConfig, scenario: Scenario, weights: Weights
 ) -> Float[np.ndarray, "n n"]:
-    return np.asarray(difftune.model_objective(config, robot, **scenario).matrix(weights))
+    return np.asarray(difftune.model_objective(config, scenario).matrix(weights))
 
 
 def _usable(
     config: TuneConfig,
     problem: Problem,
-    scenarios: list[dict[str, Any]],
+    scenarios: list[Scenario],
     found: Sequence[evaluate.Evaluation],
-) -> tuple[list[dict[str, Any]], Float[np.ndarray, " n"]]:
+) -> tuple[list[Scenario], Float[np.ndarray, " n"]]:
     """Return the rollouts of a problem that count, and their losses at the start.
 
     Drawn variations with which the start falls are left out, if not all are.
@@ -136,10 +136,10 @@ def _objective(setup: Setup, start: Weights, problem: Problem) -> Objective:
     pool, config, robot, _ = setup
 
     def of_all(
-        job: Callable[..., Any], scenarios: Sequence[dict[str, Any]], weights: Weights
+        job: Callable[..., Any], scenarios: Sequence[Scenario], weights: Weights
     ) -> list[Any]:
-        inputs = config, robot, jax.tree.map(np.asarray, weights)
-        return [f.result() for f in [pool.submit(job, *inputs, s) for s in scenarios]]
+        host = jax.tree.map(np.asarray, weights)
+        return [f.result() for f in [pool.submit(job, config, s, host) for s in scenarios]]
 
     scenarios, losses = _scenarios(config, robot, problem), np.ones(1)
     if len(scenarios) > 1:
@@ -163,15 +163,21 @@ def _tune_on_gpu(setup: Setup, start: Weights, problem: Problem) -> Tuning:
     models, losses = _scenarios(config, robot, problem), np.ones(1)
     if len(models) > 1:
         at = difftune.init(config, start).start
-        found = [_evaluation_job(config, robot, at, model) for model in models]
+        found = [_evaluation_job(config, model, at) for model in models]
         models, losses = _usable(config, problem, models, found)
-    effects = [model["effect"] for model in models] if problem.draws else [models[0]["effect"]]
-    scenarios = []
-    for i, (model, scale) in enumerate(zip(models, losses / losses.mean(), strict=True)):
-        place = model["command"], model["anchor"], np.asarray(i % len(effects))
-        weighed = *place, config.loss, np.asarray(scale), model.get("variation")
-        scenarios.append(batch.Scenario(*weighed))
-    problems = stack([batch.Problem(start, stack(scenarios), np.asarray(1.0))])
+    effects = [model.effect for model in (models if problem.draws else models[:1])]
+    scenarios = [
+        batch.BatchScenario(
+            command=model.command,
+            anchor=model.anchor,
+            effect=np.asarray(i % len(effects)),
+            loss=config.loss,
+            scale=np.asarray(scale),
+            variation=model.variation,
+        )
+        for i, (model, scale) in enumerate(zip(models, losses / losses.mean(), strict=True))
+    ]
+    problems = stack([batch.BatchProblem(start, stack(scenarios), np.asarray(1.0))])
     found = batch.tune_batch(config, robot, problems, stack(effects))
     return difftune.single(jax.tree.map(lambda x: x[0], found))
 
@@ -275,8 +281,10 @@ def tune(
 
 
 def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:
-    norms = partial(evaluate.gradient_norms, config.rollout, robot, nominal(robot))
-    results = [norms(**model, loss=config.loss) for model in _scenarios(config, robot, problem)]
+    results = [
+        evaluate.gradient_norms(config.rollout, scenario, nominal(robot), config.loss)
+        for scenario in _scenarios(config, robot, problem)
+    ]
     return jax.tree.map(lambda *x: float(np.mean(x)), *results)
 
 
@@ -321,10 +329,10 @@ def _prepare_tuning(config: TuneConfig, robot: Robot, start: Weights, problem: P
     """Compile the programs of a tuning, so that its first call need not."""
     scenario, *_ = _scenarios(config, robot, problem)
     weights = difftune.init(config, start).start
-    evaluation = _evaluation_job(config, robot, weights, scenario)
+    evaluation = _evaluation_job(config, scenario, weights)
     if not problem.draws:
         difftune.check_start(StepStatus(int(step_status(config, evaluation))), evaluation)
-    _matrix_job(config, robot, weights, scenario)
+    _matrix_job(config, scenario, weights)
 
 
 def compile_programs(

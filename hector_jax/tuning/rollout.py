@@ -164,9 +164,19 @@ def command_history(command: Wrench) -> Wrench:
     return jax.tree.map(lambda w: jnp.broadcast_to(w, (HISTORY, *jnp.shape(w))), command)
 
 
-def init_carry(robot: Robot, anchor: Anchor, variation: Variation | None = None) -> Carry:
+class Scenario(NamedTuple):
+    """What a rollout walks, beside its settings and the weights."""
+
+    robot: Robot  # the body that the controller assumes
+    command: Command  # velocities
+    anchor: Anchor  # standing pose and gait tick of t = 0, see `reference.standing_anchor`
+    effect: jax.tree_util.Partial  # phi, `Window -> Effect`
+    variation: Variation | None = None  # None: the noise and the delay of the settings
+
+
+def init_carry(scenario: Scenario) -> Carry:
     """Return the carry of a robot standing at its anchor, its weight shared by all feet."""
-    zero = jnp.zeros(3)
+    robot, anchor, zero = scenario.robot, scenario.anchor, jnp.zeros(3)
     trunk = anchor.position - robot.com_offset
     local = foot_poses(robot, jnp.asarray(robot.standing_joints)).position
     share = robot.mass / len(local) * jnp.asarray(robot.gravity)
@@ -174,7 +184,7 @@ def init_carry(robot: Robot, anchor: Anchor, variation: Variation | None = None)
     state = State(zero, anchor.position, zero, zero)
     feet = Feet(trunk + local, jnp.zeros(len(local)))
     commands = command_history(standing)
-    before = None if variation is None else ground_effect(standing)
+    before = None if scenario.variation is None else ground_effect(standing)
     return Carry(state, feet, commands, anchor, NO_DISTURBANCE, jnp.asarray(False), before)
 
 
@@ -199,16 +209,21 @@ def _moved_by(
     variation: Variation,
     robot: Robot,
     state: State,
-    now: Effect,
-    feet: Float[Array, "feet 3"],
-    before: Effect,
-    feet_before: Float[Array, "feet 3"],
+    *,
     dt: float,
+    now: tuple[Effect, Float[Array, "feet 3"]],
+    before: tuple[Effect, Float[Array, "feet 3"]],
 ) -> State:
-    """Step the body with its variation; the delayed share acts at the last tick's feet."""
+    """Step the body with its variation; the delayed share acts at the last tick's feet.
+
+    `now` and `before` are the effects of this and of the last tick, and the feet [m].
+    """
     share = variation.delay / dt
-    mixed = jax.tree.map(lambda new, old: (1.0 - share) * new + share * old, now, before)
-    lever = share * jnp.cross(feet_before - feet, before.wrench.force)
+    (response, feet), (response_before, feet_before) = now, before
+    mixed = jax.tree.map(
+        lambda new, old: (1.0 - share) * new + share * old, response, response_before
+    )
+    lever = share * jnp.cross(feet_before - feet, response_before.wrench.force)
     wrench = mixed.wrench._replace(moment=mixed.wrench.moment + lever)
     body = robot._replace(
         mass=variation.mass * robot.mass, inertia=variation.inertia * jnp.asarray(robot.inertia)
@@ -249,9 +264,10 @@ def _on_real_ground(
 def _sample(
     config: RolloutConfig,
     robot: Robot,
+    *,
     before: Carry,
     after: Carry,
-    response: Effect,
+    effect: Wrench,
     planned: Plan,
     reference: State,
 ) -> Trajectory:
@@ -262,7 +278,7 @@ def _sample(
         state=after.state,
         reference=reference,
         command=planned.wrench,
-        effect=response.wrench,
+        effect=effect,
         contact=planned.contact,
         feet=after.feet.position,
         joints=jnp.asarray(robot.standing_joints),
@@ -276,20 +292,19 @@ def _sample(
 
 def step_carry(
     config: RolloutConfig,
-    robot: Robot,
+    scenario: Scenario,
     weights: Weights,
-    command: Command,
-    effect: jax.tree_util.Partial,
     carry: Carry,
     tick: Int[Array, ""],
-    variation: Variation | None = None,
+    *,
     wrench: Wrench | None = None,
 ) -> tuple[Carry, Trajectory]:
     """Walk one tick of the closed loop: plan, effect, motion.
 
     Returns the next carry and the tick's sample of the trajectory. A `wrench` takes the place of
-    the planned one.
+    the planned one. The anchor is that of the carry.
     """
+    robot, command, _, effect, variation = scenario
     walk, dt = config.walk, config.walk.gait.tick
     new_anchor = anchor_at(robot, carry.state, carry.anchor.tick)
     anchor = where(tick == new_anchor.tick, new_anchor, carry.anchor)
@@ -319,13 +334,27 @@ def step_carry(
         state = srbm.step(robot, carry.state, response.wrench, feet.position, dt, response.legs)
     else:
         assert carry.before is not None  # `init_carry` starts with the effect of standing
-        last = carry.before, carry.feet.position
-        state = _moved_by(variation, robot, carry.state, response, feet.position, *last, dt)
+        state = _moved_by(
+            variation,
+            robot,
+            carry.state,
+            dt=dt,
+            now=(response, feet.position),
+            before=(carry.before, carry.feet.position),
+        )
     fallen = carry.fallen | has_fallen(state, *robot.description.limits)
     before = None if variation is None else response
     after = Carry(state, feet, commands, anchor, disturbance, fallen, before)
-    reference = reference_at(dt, command, anchor, tick + 1.0)
-    return after, _sample(config, robot, carry, after, response, planned, reference)
+    sample = _sample(
+        config,
+        robot,
+        before=carry,
+        after=after,
+        effect=response.wrench,
+        planned=planned,
+        reference=reference_at(dt, command, anchor, tick + 1.0),
+    )
+    return after, sample
 
 
 def walked_ticks(config: RolloutConfig, anchor: Anchor) -> Int[Array, " ticks"]:
@@ -340,25 +369,20 @@ def from_start(config: RolloutConfig, samples: Trajectory) -> Trajectory:
     return walk._replace(initial=initial, period=jnp.asarray(config.walk.gait.tick))
 
 
-def rollout(
-    config: RolloutConfig,
-    robot: Robot,
-    weights: Weights,
-    command: Command,
-    anchor: Anchor,
-    effect: jax.tree_util.Partial,
-    variation: Variation | None = None,
-) -> Trajectory:
+def with_variation(config: RolloutConfig, scenario: Scenario) -> Scenario:
+    """Return a scenario with its variation, or that of the settings if it has none."""
+    if scenario.variation is not None:
+        return scenario
+    return scenario._replace(variation=variation_of(config))
+
+
+def rollout(config: RolloutConfig, scenario: Scenario, weights: Weights) -> Trajectory:
     """Walk on the single rigid body: `lead` ticks in place from standing, then the command.
 
     Args:
         config: static settings.
-        robot: the body.
+        scenario: robot, command, start, phi and variation.
         weights: theta; the gradient is taken with respect to these.
-        command: commanded velocities.
-        anchor: standing pose and gait tick of t = 0, see `reference.standing_anchor`.
-        effect: phi, `Window -> Effect`.
-        variation: difference from the controller's model; None: the noise and delay of `config`.
 
     Returns:
         Trajectory of T samples from t = 0. Nothing raises: check `fallen` and `residual` before
@@ -367,16 +391,14 @@ def rollout(
     Source: Eq. 12, 13.
     """
     policy = jax.checkpoint_policies.save_only_these_names(qp.SAVED)
-    variation = variation_of(config) if variation is None else variation
-    first, ticks = init_carry(robot, anchor, variation), walked_ticks(config, anchor)
+    scenario = with_variation(config, scenario)
+    first, ticks = init_carry(scenario), walked_ticks(config, scenario.anchor)
 
     # A GPU copies one array of all numbers in a tick faster than many small ones. How to unpack a
     # sample is known only while a tick is traced: the scan returns it as a tree without arrays.
     def tick(packed: jax.Array, number: Int[Array, ""]) -> tuple:
         carry = unpack(layout(first), packed)
-        after, sample = step_carry(
-            config, robot, weights, command, effect, carry, number, variation
-        )
+        after, sample = step_carry(config, scenario, weights, carry, number)
         assert layout(after) == layout(first)
         return pack(after), (pack(sample), jax.tree_util.Partial(partial(unpack, layout(sample))))
 

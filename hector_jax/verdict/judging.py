@@ -25,7 +25,7 @@ from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import Imperfections
 from hector_jax.store.cache import content_key, load_or_make
 from hector_jax.store.setup import Setup
-from hector_jax.tuning.rollout import rollout, rollout_config
+from hector_jax.tuning.rollout import Scenario, rollout, rollout_config
 from hector_jax.verdict import metrics
 
 # modules that determine the numbers, for `content_key`
@@ -73,8 +73,8 @@ def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: f
     """Return a walk of `seconds` on the plain rigid body, without a tuning's noise and delay."""
     config = rollout_config(robot, round(seconds / walk_config(robot).gait.tick))
     config = replace(config, estimate_noise=0.0, delay=0.0)
-    inputs = config, robot, weights, command, standing_anchor(robot), last_command
-    return jax.device_get(jax.jit(rollout, static_argnums=0)(*inputs))
+    scenario = Scenario(robot, command, standing_anchor(robot), last_command)
+    return jax.device_get(jax.jit(rollout, static_argnums=0)(config, scenario, weights))
 
 
 def _score_walk(setup: Setup, job: Job, walk: Trajectory, engine: Engine) -> ScoredWalk:

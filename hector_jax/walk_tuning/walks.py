@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.control.parameters import steps_between
-from hector_jax.control.reference import Command
+from hector_jax.control.reference import Command, standing_anchor
 from hector_jax.control.weights import Weights, direction_names
 from hector_jax.control.weights_file import save_weights, weights_tree
 from hector_jax.core.console import bar, say
@@ -46,6 +46,7 @@ from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig, step_status
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.grounded import Grounding, evaluate_grounded, fit_grounding, grounded_matrix
+from hector_jax.tuning.rollout import Scenario
 from hector_jax.tuning.status import StepStatus
 from hector_jax.walk_tuning.campaign import (
     Campaign,
@@ -96,7 +97,8 @@ def _ground_job(campaign: Campaign, weights: Weights, command: Command, log: Log
     config, robot = campaign.config.rollout, campaign.robot
     effect = network.effect_of(None, config.walk)
     trajectory = trajectory_of(log, config.walk.gait.tick)
-    grounding = fit_grounding(config, robot, weights, command, effect, trajectory)
+    scenario = Scenario(robot, command, standing_anchor(robot), effect)
+    grounding = fit_grounding(config, scenario, weights, trajectory)
     if not campaign.grounded:
         grounding = grounding._replace(residuals=jax.tree.map(jnp.zeros_like, grounding.residuals))
     return jax.device_get(grounding)
