@@ -54,7 +54,8 @@ from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs, ideal
 from hector_jax.tuning.difftune import TuneConfig, tune, tune_step
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
-from hector_jax.tuning.rollout import RolloutConfig, Scenario, no_variation, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
+from hector_jax.tuning.variation import no_variation
 
 ROOT = Path(__file__).parents[1]
 STRIDER = ROOT / "examples" / "strider" / "robot.toml"

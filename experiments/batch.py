@@ -44,8 +44,8 @@ from hector_jax.store.setup import Setup
 from hector_jax.tuning.batch import BatchProblem, BatchScenario, tail_weights, tune_batch
 from hector_jax.tuning.difftune import TuneConfig, Tuning, single
 from hector_jax.tuning.loss import PAPER_LOSS, Terms, with_alphas
-from hector_jax.tuning.rollout import Variation, no_variation
 from hector_jax.tuning.status import Stop
+from hector_jax.tuning.variation import Variation, no_variation
 from hector_jax.verdict import judging
 from hector_jax.verdict.metrics import Score
 

@@ -39,8 +39,9 @@ from hector_jax.tuning.difftune import TuneConfig, tune
 from hector_jax.tuning.evaluate import Evaluation, Objective
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
 from hector_jax.tuning.parallel_rollout import parallel_rollout
-from hector_jax.tuning.rollout import RolloutConfig, Scenario, no_variation, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.tuning.status import StepStatus, Stop
+from hector_jax.tuning.variation import no_variation
 
 ROBOT = load_robot()
 ANCHOR = standing_anchor(ROBOT)

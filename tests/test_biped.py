@@ -51,7 +51,7 @@ foot_jacobians_jit = jax.jit(foot_jacobians)
 def inverse_legs_jit(robot, position, yaw, up, steps=16):
     """From the standing pose, which takes more steps than from a moment before."""
     start = jnp.asarray(robot.standing_joints)
-    return kinematics.inverse_legs(robot, position, yaw, up, start, steps)
+    return kinematics.inverse_legs(robot, position, yaw, up, start, steps=steps)
 
 
 inverse_forward = jax.jit(jax.jacfwd(inverse_legs_jit, argnums=1))

@@ -36,7 +36,7 @@ from hector_jax.store.nets import CollectConfig, collection_settings
 from hector_jax.store.setup import Setup
 from hector_jax.store.tunings import tune_config
 from hector_jax.tuning.loss import PAPER_LOSS, LossTerm
-from hector_jax.tuning.rollout import variation_of
+from hector_jax.tuning.rollout import Scenario, with_variation
 from hector_jax.verdict import judging
 from hector_jax.walk_tuning import searches, walks
 from hector_jax.walk_tuning.campaign import Campaign
@@ -53,8 +53,9 @@ def robot_with(**settings):
 def test_noise_and_delay_of_a_tuning_are_in_its_settings_and_keys(setting):
     noisy = robot_with(**setting)
     one, other = tune_config(ROBOT), tune_config(noisy)
-    assert variation_of(one.rollout) is None
-    assert variation_of(other.rollout) is not None
+    scenario = Scenario(ROBOT, None, None, None)
+    assert with_variation(one.rollout, scenario).variation is None
+    assert with_variation(other.rollout, scenario).variation is not None
     assert key(one) != key(other)
     assert robot_hash(ROBOT) != robot_hash(noisy)
     config = CollectConfig(engine="c")
@@ -258,8 +259,8 @@ def test_a_record_of_a_number_of_the_user_goes_on_in_its_box_only(monkeypatch, t
 
 
 def test_our_functions_and_installed_ones_have_their_names():
-    assert function_id(variation_of) == "hector_jax.tuning.rollout.variation_of"
-    assert function_id(jax.jit(variation_of)) == "hector_jax.tuning.rollout.variation_of"
+    assert function_id(with_variation) == "hector_jax.tuning.rollout.with_variation"
+    assert function_id(jax.jit(with_variation)) == "hector_jax.tuning.rollout.with_variation"
     assert function_id(np.linalg.norm).startswith("numpy.linalg.norm#")
 
 

@@ -20,7 +20,8 @@ from hector_jax.core.trajectory import State
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.parallel_rollout import _newton, _Step, parallel_rollout
-from hector_jax.tuning.rollout import RolloutConfig, Scenario, no_variation, rollout, rollout_config
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout, rollout_config
+from hector_jax.tuning.variation import no_variation
 
 EFFECT = small_effect()
 FIELDS = "initial", "state", "reference", "command", "effect", "feet"

@@ -244,7 +244,8 @@ def walk_once(
     robot: Robot,
     trajectory: NamedCommand,
     weights: Weights,
-    plant: Robot | None,
+    *,
+    plant: Robot | None = None,
     engine: Engine = MUJOCO_C,
 ) -> Trajectory:
     """Walk once in the world of the flags; `plant` is another model of the robot."""

@@ -162,8 +162,8 @@ def examine_robot(args: flags.Robot) -> None:
         if proposal.error is None:
             try:
                 loss_of_robot(robot.description)
-                inputs = robot, walk_config(robot), nominal(robot)
-                lines += section("delay", margin.delay_lines(*inputs))
+                told_delay = margin.delay_lines(robot, walk_config(robot), nominal(robot))
+                lines += section("delay", told_delay)
             except InputError as error:  # a setting that controller or loss refuse
                 wrong.append(str(error))
         lines += section("mended", changes(robot))

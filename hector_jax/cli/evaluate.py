@@ -60,8 +60,17 @@ def evaluate(args: Evaluate) -> None:
     config, engine = tunings.tune_config(robot), choose_engine(args.engine)
     with workers(args.processes) as pool:
         title = f"evaluating on {plural(count, 'plant')} of {args.world}"
-        inputs = Setup(pool, config, robot), sets, trajectory.command, plants, seeds
-        walks = judging.judge(*inputs, title=title, seconds=seconds, plant=plant, engine=engine)
+        walks = judging.judge(
+            Setup(pool, config, robot),
+            sets,
+            trajectory.command,
+            plants,
+            seeds,
+            title=title,
+            seconds=seconds,
+            plant=plant,
+            engine=engine,
+        )
     verdict = metrics.make_verdict(config.loss, seeds, {trajectory.name: walks.scores})
     title = f"{trajectory.name}, {plural(count, 'plant')}"
     result = metrics.as_result(verdict, args.world) | {"engine": engine.name}

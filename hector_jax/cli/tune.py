@@ -267,8 +267,8 @@ def _tune_sets(run: _Run) -> _Tuned:
         campaign = _campaign(run, sets["before_walks"])
         proposals = tune_on_walks(setup.pool, campaign, run.args.walks)
         stages = candidates(setup.pool, campaign, proposals)
-        inputs = setup, stages, commands, choice.HELD_OUT
-        best = choice.walks_best(*inputs, **options, engine=campaign.engine)
+        engine = campaign.engine
+        best = choice.walks_best(setup, stages, commands, choice.HELD_OUT, engine=engine, **options)
         sets["best"] = stages[best]
     for name, weights in sets.items():
         save_weights(run.folder / "weights" / f"{name}.json", weights)
@@ -359,8 +359,15 @@ def _draw(run: _Run, tuned: _Tuned, standin: ScoredWalks, on_hfs: ScoredWalks) -
     with ThreadPoolExecutor(1) as background:  # another process draws the film
         film = background.submit(_film, run, standin)
         curves = fidelity.curves(run.setup.robot, on_hfs.first["nominal"], effects)
-        inputs = tuned.sets, tuned.tunings, standin.first, curves, run.net.history
-        drawings = pictures.of_run(run.folder, run.setup.config, *inputs)
+        drawings = pictures.of_run(
+            run.folder,
+            run.setup.config,
+            sets=tuned.sets,
+            tunings=tuned.tunings,
+            walks=standin.first,
+            ground=curves,
+            training=run.net.history,
+        )
     return {"pictures": drawings, "film": film.result()}
 
 

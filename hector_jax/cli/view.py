@@ -51,7 +51,7 @@ def view_run(args: View) -> None:
         lines = [f"**{request.trajectory}** in {world}, seed {args.seed}"]
         say(f"walking in {args.world}, seed {args.seed}")
         for when, (name, (weights, words)) in zip(("before", "after"), sets.items(), strict=True):
-            trajectory = arguments.walk_once(args, robot, command, weights, None)
+            trajectory = arguments.walk_once(args, robot, command, weights)
             loss = metrics.score(request.loss, trajectory).L / 1e6
             lines.append(f"{when}: {words}, L {loss:.3f}e6 in this walk")
             say(f"  {lines[-1]}")

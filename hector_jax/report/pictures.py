@@ -25,6 +25,7 @@ from hector_jax.tuning.loss import Loss
 def of_run(
     folder: Path,
     config: TuneConfig,
+    *,
     sets: Mapping[str, Weights],
     tunings: Mapping[str, Tuning],
     walks: Mapping[str, Trajectory],

@@ -242,7 +242,7 @@ def _add_foot(spec: mujoco.MjSpec, description: Description, pieces: Pieces, leg
         text = f"feet.{description.legs[leg]}.body is {foot.body!r}, expected one that joint "
         text += f"{description.joints[last - 1]!r} moves: {', '.join(poses)}"
         expect(path, foot.body in poses, text)
-        _add_foot_by_points(spec, foot, names, pieces, link, poses[foot.body])
+        _add_foot_by_points(spec, foot, names, pieces, on=(link, poses[foot.body]))
         return
     for name in names.contacts:
         geom = spec.geom(name)
@@ -257,9 +257,13 @@ def _add_foot(spec: mujoco.MjSpec, description: Description, pieces: Pieces, leg
 
 
 def _add_foot_by_points(
-    spec: mujoco.MjSpec, foot: Foot, names: NamedFoot, pieces: Pieces, link: Link, pose: Pose
+    spec: mujoco.MjSpec, foot: Foot, names: NamedFoot, pieces: Pieces, *, on: tuple[Link, Pose]
 ) -> None:
-    """Add the site and spheres whose lowest points in the standing pose are the contacts."""
+    """Add the site and spheres whose lowest points in the standing pose are the contacts.
+
+    `on` is the link that moves the foot, and the pose in it of the body that the foot names.
+    """
+    link, pose = on
     contacts = np.array([pose.p + pose.R @ np.array(contact) for contact in foot.contacts])
     data = _standing_data(spec, pieces)
     R, body = data.body(link.name).xmat.reshape(3, 3), spec.body(link.name)

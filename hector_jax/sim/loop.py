@@ -89,12 +89,12 @@ def effect_of(robot: Robot, before: Float[Array, " reading"], ground: Ground) ->
 def sample(
     config: WalkConfig,
     robot: Robot,
+    *,
     command: Command,
     anchor: Anchor,
     time: Float[Array, ""],
     yaw: Float[Array, ""],
     after: Float[Array, " reading"],
-    *,
     effect: Wrench,
     touches: Touches,
 ) -> Sample:

@@ -37,8 +37,9 @@ from hector_jax.tuning import batch, difftune, evaluate
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning, step_status
 from hector_jax.tuning.evaluate import Objective, mean_objective
 from hector_jax.tuning.loss import loss_of_robot
-from hector_jax.tuning.rollout import Scenario, drawn_variation, rollout_config
+from hector_jax.tuning.rollout import Scenario, rollout_config
 from hector_jax.tuning.status import StepStatus
+from hector_jax.tuning.variation import drawn_variation
 
 # modules that determine the numbers, for `content_key`
 TUNING_CODE = ("store.tunings", "tuning.difftune", "grfm.network")
@@ -86,7 +87,7 @@ def _scenarios(config: TuneConfig, robot: Robot, problem: Problem) -> list[Scena
         net = params if params is None else member(params, seed)
         tick = seed % 2 * (walk.gait.cycle // 2)
         anchor, effect = standing_anchor(robot, tick), network.effect_of(net, walk)
-        variation = drawn_variation(config.rollout, robot, seed)
+        variation = drawn_variation(walk, robot, seed)
         scenarios.append(Scenario(robot, command, anchor, effect, variation))
     return scenarios
 

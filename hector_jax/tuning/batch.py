@@ -35,8 +35,9 @@ from hector_jax.tuning.difftune import Iteration, TuneConfig, TuneState, Tuning
 from hector_jax.tuning.evaluate import Evaluation, Walk, evaluate
 from hector_jax.tuning.loss import PAPER_LOSS, Loss
 from hector_jax.tuning.parallel_rollout import parallel_rollout
-from hector_jax.tuning.rollout import RolloutConfig, Scenario, Variation, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.tuning.status import Stop
+from hector_jax.tuning.variation import Variation
 
 AXIS = "problems"
 PER_CALL = 11  # evaluations per problem and call of the device: start and ten

@@ -83,8 +83,8 @@ def _score_walk(setup: Setup, job: Job, walk: Trajectory, engine: Engine) -> Sco
     samples, text = int(np.sum(~np.asarray(walk.fallen))), ""  # upright samples
     upright = samples * float(walk.period)
     if not samples and not engine.differs:
-        inputs = config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
-        if fall := pool.submit(fall_of, *inputs).result():
+        body, host_job = jax.tree.map(np.asarray, robot), on_host(job)
+        if fall := pool.submit(fall_of, config.rollout.walk, body, host_job).result():
             upright, text = fall.time, str(fall)
     last = jax.tree.map(lambda x: np.asarray(x)[max(samples - 1, 0)], walk.state)
     score = metrics.score(config.loss, walk)
@@ -100,8 +100,8 @@ def _like(setup: Setup, with_walk: bool) -> Any:
 
 def _file_name(setup: Setup, case: Case, job: Job, with_walk: bool, engine: Engine) -> str:
     _, config, robot, _ = setup
-    inputs = engine.key, config.rollout.walk, repr(config.loss), robot, job
-    key = content_key(*inputs, *([job.plant] if job.plant else []), code=(*engine.modules, *_CODE))
+    parts = [engine.key, config.rollout.walk, repr(config.loss), robot, job]
+    key = content_key(*parts, *([job.plant] if job.plant else []), code=(*engine.modules, *_CODE))
     return "-".join(["walk" if with_walk else "score", *map(str, case), f"{key}.npz"])
 
 
