@@ -52,7 +52,7 @@ from hector_jax.store.setup import Setup
 from hector_jax.tuning.loss import loss_of
 from hector_jax.verdict import judging, metrics
 from hector_jax.walk_tuning.campaign import Campaign, box_of, weights_at
-from hector_jax.walk_tuning.walks import space_of
+from hector_jax.walk_tuning.walks import campaign_space
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,10 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
         return generation
 
     path = campaign.folder / "generations.jsonl"
-    rows, space = read_journal(path, head, what="search", parse=parse), space_of(pool, campaign)
+    rows, space = (
+        read_journal(path, head, what="search", parse=parse),
+        campaign_space(pool, campaign),
+    )
     losses = partial(losses_of, pool, campaign, engine, batch=size * len(campaign.cases))
     at_start = next(losses([campaign.start]))
     if not np.isfinite(at_start).all():

@@ -326,7 +326,7 @@ def read_model(pool: Executor, campaign: Campaign, *, searches: bool) -> Model:
         save_tree(path, parts, kind="searches", robot=campaign.robot)
     if searches:
         parts = load_tree(path, parts, kind="searches", robot=campaign.robot)[0]
-    return Model(walks.space_of(pool, campaign), **parts)
+    return Model(walks.campaign_space(pool, campaign), **parts)
 
 
 def main() -> None:

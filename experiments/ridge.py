@@ -66,7 +66,9 @@ def walk_robot(flags: Flags, pool: Executor, name: str, file: Path | None) -> Lo
     for ridge in flags.ridges:
         setup = Setup(pool, tunings.tune_config(robot, ridge=ridge), robot)
         folder = flags.out / "kept" / name
-        tuned = tunings.tune(setup, problems, folder, title=f"{name}: tuning with ridge {ridge:g}")
+        tuned = tunings.tune_all(
+            setup, problems, folder, title=f"{name}: tuning with ridge {ridge:g}"
+        )
         sets |= {(key, ridge): found.tuning.weights for key, found in tuned.items()}
     setup = Setup(pool, tunings.tune_config(robot), robot)
     plants = choice.drawn_plants(robot, flags.plants, FIRST_SEED)

@@ -23,13 +23,13 @@ from hector_jax.tuning.rollout import (
     Carry,
     RolloutConfig,
     Scenario,
-    from_start,
     init_carry,
     step_carry,
     varied,
     walked_ticks,
     with_constants,
     with_variation,
+    without_lead,
 )
 
 
@@ -97,7 +97,7 @@ def propagate(
     carry, ticks = init_carry(scenario), walked_ticks(config, scenario.anchor)
     _, (samples, columns) = jax.lax.scan(tick, (carry, no_tangents(carry, weights)), ticks)
     columns = jax.tree.map(lambda s: jnp.swapaxes(s[config.lead :], 0, 1), columns)
-    return from_start(config, samples), columns
+    return without_lead(config, samples), columns
 
 
 def gradient(

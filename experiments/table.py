@@ -97,7 +97,7 @@ def main() -> None:
     setup_jax()
     path, by_trajectory = make_table(flags, lambda seeds: list(map(FAMILIES[flags.family], seeds)))
     if flags.json:
-        results = {name: metrics.as_result(verdict) for name, verdict in by_trajectory.items()}
+        results = {name: metrics.verdict_result(verdict) for name, verdict in by_trajectory.items()}
         print(as_json({"report": str(path), "trajectories": results}))
     else:
         for name, verdict in by_trajectory.items():

@@ -287,7 +287,7 @@ def _result(table: Table, sets: Summaries) -> dict[str, Any]:
     """Return the table as JSON values, with every score by seed."""
     trajectories = {}
     for trajectory, verdict in table.verdicts.items():
-        result: dict[str, Any] = {**metrics.as_result(verdict), "family": table.family}
+        result: dict[str, Any] = {**metrics.verdict_result(verdict), "family": table.family}
         for name, score in verdict.scores.items():
             by_seed = {part: losses[:, 0].tolist() for part, losses in score.losses.items()}
             by_seed["fallen"] = score.fallen[:, 0].astype(bool).tolist()

@@ -56,7 +56,7 @@ def search(
     settings = replace(config, budget=config.population)  # a record continues to any budget
     model = engine.key, tune.rollout, repr(tune.loss)
     key = content_key(*model, settings, robot, hfs(), nominal(), code=SEARCH_CODE)
-    return searches.search(
+    return searches.search_all(
         bench.setup,
         config,
         nominal(),
@@ -74,11 +74,11 @@ def tune(bench: Bench, name: str, steps: int, plants: int) -> dict[str, Tuned]:
     command = named_command(name)
     problems = {"without": Problem((command,), None), "with": Problem((command,), bench.params)}
     title = f"tuning {name} without and with GRFM-Net"
-    results = tunings.tune(bench.setup, problems, bench.folder / name, title=title)
+    results = tunings.tune_all(bench.setup, problems, bench.folder / name, title=title)
     rule = bench.setup._replace(config=replace(bench.setup.config, rule="relative", iterations=10))
     title = f"tuning {name} by the paper's rule"
     problems = {"paper": problems["with"]}
-    results = tunings.tune(rule, problems, bench.folder / name, title=title) | results
+    results = tunings.tune_all(rule, problems, bench.folder / name, title=title) | results
     if steps:
         start = results["with"].tuning.weights
         try:

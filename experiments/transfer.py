@@ -170,7 +170,7 @@ def tuned_sets(
         if name not in loaded
     }
     setup = Setup(pool, config, robot, environment().get("commit", ""))
-    results = tunings.tune(setup, problems, flags.out, title="tuning")
+    results = tunings.tune_all(setup, problems, flags.out, title="tuning")
     return {**loaded, **{name: tuned.tuning.weights for name, tuned in results.items()}}
 
 

@@ -80,7 +80,7 @@ def tune_toys(folder: Path, setup, start, problems, title, on_iteration):
 
 def tuning(folder: Path) -> None:
     tunings._tunings = partial(tune_toys, folder)
-    tunings.tune(
+    tunings.tune_all(
         Setup(ThreadPoolExecutor(1), TuneConfig(iterations=60), ROBOT),
         {"toy": Problem((S,), None)},
         folder,
@@ -108,7 +108,7 @@ def training(folder: Path) -> None:
         collect(walks, jobs, partial(walk_jobs, walks), robot=ROBOT)
     config = TrainConfig(os.environ.get("VARIANT", "paper"), epochs=60, batch=16)
     if not (folder / "net.npz").exists():
-        nets.train(config, ROBOT, walks, folder / "net.npz")
+        nets.train_net(config, ROBOT, walks, folder / "net.npz")
 
 
 def table(folder: Path) -> None:
@@ -121,7 +121,7 @@ def table(folder: Path) -> None:
     setup = Setup(ThreadPoolExecutor(1), TuneConfig(iterations=20), ROBOT)
     problems = {"without": Problem((S,), None)}
     with locked(folder):
-        tuned = tunings.tune(setup, problems, folder / "s", title="")["without"]
+        tuned = tunings.tune_all(setup, problems, folder / "s", title="")["without"]
         sets = {"nominal": nominal(), "expert": expert(), "without": tuned.tuning.weights}
         seeds = range(WALKS // 2)
         plants = [hfs()] * len(seeds)

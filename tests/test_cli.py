@@ -352,7 +352,7 @@ def test_a_search_leaves_weights_with_a_card_and_walks_nothing_twice(monkeypatch
 @pytest.mark.parametrize("asked", ["json", "words"])
 def test_training_prints_the_errors_and_nothing_else(monkeypatch, capsys, tmp_path, asked):
     errors = {"raw": {"force": 2.0, "moment": 1.0}, "net": {"force": 0.5, "moment": 0.25}}
-    monkeypatch.setattr(nets, "train", lambda *args: SimpleNamespace(errors=errors, args=args))
+    monkeypatch.setattr(nets, "train_net", lambda *args: SimpleNamespace(errors=errors, args=args))
     more = ("--json",) if asked == "json" else ()
     assert call(monkeypatch, "train", "--out", tmp_path / "net.npz", *more) == 0
     out = capsys.readouterr().out

@@ -35,7 +35,7 @@ from hector_jax.control.weights_file import load_weights, save_weights, weights_
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, pack_wrench
 from hector_jax.export import export
-from hector_jax.export.controller import Check, _measured, check, record
+from hector_jax.export.controller import Check, _measured, compare_with_live, record
 from hector_jax.export.export import (
     PLATFORMS,
     SCHEMA,
@@ -329,7 +329,7 @@ def loaded(exported):
 
 def test_the_loaded_controller_answers_as_the_live_one_did(loaded):
     walked = record(CONFIG, ROBOT, TUNED, command=named_command("s"), seconds=0.4)
-    found = check(CONFIG, *loaded, walked)
+    found = compare_with_live(CONFIG, *loaded, walked)
     assert max(found.force, found.moment, found.torque) <= TOLERANCE
     assert found.unsolved == 0
     assert np.abs(walked.wrench.force).max() > 100.0
@@ -371,7 +371,7 @@ YAWS = {
 @pytest.mark.parametrize("see", YAWS.values(), ids=YAWS)
 def test_the_measured_yaw_may_be_of_any_turn(loaded, turning, see):
     assert abs(turning.measurement.state.euler[-1, 2]) > 3.3
-    found = check(CONFIG, *loaded, seen_as(turning, see))
+    found = compare_with_live(CONFIG, *loaded, seen_as(turning, see))
     assert max(found.force, found.moment, found.torque) <= TOLERANCE
     assert found.unsolved == 0
 
@@ -424,7 +424,7 @@ def test_a_yaw_that_is_no_number_is_seen_and_then_forgotten(loaded):
 def test_the_check_notices_other_weights(loaded, weights, part):
     """Also those that differ in the numbers of plan and legs alone."""
     other = CONFIG.with_others(weights(), OTHERS)
-    found = check(
+    found = compare_with_live(
         CONFIG, *loaded, record(CONFIG, ROBOT, other, command=named_command("s"), seconds=0.1)
     )
     assert getattr(found, part) > {"force": 1.0, "torque": 0.1}[part]
@@ -508,7 +508,7 @@ def test_what_differs_from_the_live_controller_is_not_written(
 ):
     for part in ("export_controller", "record", "load_controller"):
         monkeypatch.setattr(export, part, lambda *args, **named: None)
-    monkeypatch.setattr(export, "check", lambda *known: found)
+    monkeypatch.setattr(export, "compare_with_live", lambda *known: found)
     assert call(monkeypatch, run) == 1
     assert fault in capsys.readouterr().err
     assert list((run / "export").glob("[!.]*")) == []

@@ -121,7 +121,7 @@ REACH = {"gauss_newton": 0.3, "relative": 0.03}  # a full step goes beyond it, s
 def tune(command, params, config=CONFIG, robot=ROBOT):
     """The tuning as a run does it; with the lines that it left."""
     with ThreadPoolExecutor(1) as pool, TemporaryDirectory() as kept:
-        found = tunings.tune(
+        found = tunings.tune_all(
             Setup(pool, config, robot),
             {"with": Problem((command,), params)},
             Path(kept),

@@ -299,7 +299,7 @@ def spoilt(data, path):
 def net(folder):
     """A small net of zeros."""
     path = folder / "sound-net.npz"
-    like = network.layout("paper", (3,), WalkConfig())
+    like = network.empty_params("paper", (3,), WalkConfig())
     network.save_net(path, like, robot=ROBOT, about={})
     return path
 

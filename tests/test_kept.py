@@ -69,7 +69,7 @@ def walked(monkeypatch):
 def tune(folder, config=CONFIG, command=S, start=None):
     problems = {"without": Problem((command,), None)}
     setup = Setup(POOL, config, ROBOT, "abc")
-    return tunings.tune(setup, problems, folder, title="", start=start)["without"]
+    return tunings.tune_all(setup, problems, folder, title="", start=start)["without"]
 
 
 def judge(folder, sets, seeds=(0, 1, 2), plant=None, commit="abc"):
@@ -114,7 +114,7 @@ def test_metrics_of_a_run_that_was_cut_are_those_of_an_uncut_one(tmp_path, tuned
     def lines(folder, problems):
         folder.mkdir(exist_ok=True)
         setup = Setup(POOL, CONFIG, ROBOT)
-        tunings.tune(setup, problems, folder, title="", metrics=folder / "metrics.jsonl")
+        tunings.tune_all(setup, problems, folder, title="", metrics=folder / "metrics.jsonl")
         return (folder / "metrics.jsonl").read_text()
 
     whole = lines(tmp_path / "whole", problems)

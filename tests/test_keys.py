@@ -356,7 +356,7 @@ def search(folder, engine, monkeypatch):
     commands = {"s": named_command("s")}
     setup = Setup(Executor(), CONFIG, ROBOT)
     options = {"commands": commands, "engine": engine, "folder": folder}
-    return searches.search(setup, config, nominal(), **options)
+    return searches.search_all(setup, config, nominal(), **options)
 
 
 def journal(folder, engine, monkeypatch):

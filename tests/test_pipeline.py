@@ -85,7 +85,7 @@ def test_no_walk_is_in_two_parts(tmp_path, robot):
     walks = [set(np.unique(part.walk)) for part in parts[:3]]
     assert all(walks)
     assert sum(map(len, walks)) == len(set.union(*walks)) == 5
-    net = nets.train(TrainConfig("paper", epochs=1), robot, tmp_path, tmp_path / "net.npz")
+    net = nets.train_net(TrainConfig("paper", epochs=1), robot, tmp_path, tmp_path / "net.npz")
     held = nets.held_out_walks(robot, net)
     assert set(np.asarray(held.job.seed)) == walks[2]
 
@@ -97,7 +97,7 @@ def test_a_net_that_learns_no_touchdowns_says_so_where_they_are_asked_for(tmp_pa
     collect(tmp_path, draw_jobs(0, 5), walks, robot=LEARNS_TOUCHDOWNS)
     for variant, says in (("linear", 1), ("gated", 0)):
         config, path = TrainConfig(variant), tmp_path / f"{variant}.npz"
-        nets.train(config, LEARNS_TOUCHDOWNS, tmp_path, path)
+        nets.train_net(config, LEARNS_TOUCHDOWNS, tmp_path, path)
         line = f"tuning.touchdown_error: the net {variant} does not learn where the feet land"
         assert capsys.readouterr().err.count(line) == says
 
@@ -125,7 +125,7 @@ def test_data_follow_from_their_own_settings_whatever_command_makes_them(tmp_pat
         made.append((config, folder))
         raise cut
 
-    monkeypatch.setattr(nets, "collect", collect)
+    monkeypatch.setattr(nets, "collect_walks", collect)
     monkeypatch.setattr(tunings, "compile_programs", lambda *args, **options: [])  # it walks
     for command in (
         flags.Tune(iterations=10, data=tmp_path / "data", out=tmp_path / "run"),
@@ -162,13 +162,13 @@ def test_walks_of_other_settings_are_refused(tmp_path, robot, others, message):
 def test_a_net_of_other_settings_or_other_walks_is_refused_and_stays(tmp_path, robot, quick):
     path = tmp_path / "grfm.npz"
     gather(tmp_path / "walks", robot)
-    nets.train(TrainConfig(epochs=2), robot, tmp_path / "walks", path)
+    nets.train_net(TrainConfig(epochs=2), robot, tmp_path / "walks", path)
     written = path.read_bytes()
     with pytest.raises(InputError, match="grfm.npz: made with epochs 2, this command expects 1;"):
         ground(tmp_path, robot)
     assert path.read_bytes() == written
     gather(tmp_path / "others", robot, draw=1)
-    nets.train(TrainConfig(epochs=1), robot, tmp_path / "others", path)
+    nets.train_net(TrainConfig(epochs=1), robot, tmp_path / "others", path)
     with pytest.raises(InputError, match="grfm.npz: made with content"):
         ground(tmp_path, robot)
 
@@ -176,7 +176,7 @@ def test_a_net_of_other_settings_or_other_walks_is_refused_and_stays(tmp_path, r
 def test_a_net_of_another_variant_is_refused_and_kept(tmp_path, robot):
     gather(tmp_path / "walks", robot)
     path = tmp_path / "grfm.npz"
-    nets.train(TrainConfig("paper", epochs=1), robot, tmp_path / "walks", path)
+    nets.train_net(TrainConfig("paper", epochs=1), robot, tmp_path / "walks", path)
     written = path.read_bytes()
     with pytest.raises(InputError, match="grfm.npz: holds grfm-paper, expected grfm-residual"):
         ground(tmp_path, robot)
@@ -188,7 +188,7 @@ def test_a_net_is_stored_by_its_variant(tmp_path, robot, quick, monkeypatch):
     path = nets.net_path(tmp_path, "paper")
     assert path == tmp_path / "grfm-paper.npz"
     gather(tmp_path / "walks", robot)
-    nets.train(TrainConfig("paper", epochs=1), robot, tmp_path / "walks", path)
+    nets.train_net(TrainConfig("paper", epochs=1), robot, tmp_path / "walks", path)
     monkeypatch.setattr(nets, "_train", None)  # nothing is to be trained again
     assert isinstance(ground(tmp_path, robot, "paper").params, PaperParams)
 
@@ -274,7 +274,7 @@ def test_a_tuning_that_fails_is_told_while_others_go_on(tmp_path, monkeypatch, r
     problems = {"without": tunings.Problem(walks, None), "with": tunings.Problem(falls, None)}
     begin, pool = time.monotonic(), ThreadPoolExecutor(2)
     with pytest.raises(InputError, match="the starting weights fall"):
-        tunings.tune(Setup(pool, TuneConfig(), robot), problems, tmp_path, title="tuning")
+        tunings.tune_all(Setup(pool, TuneConfig(), robot), problems, tmp_path, title="tuning")
     assert time.monotonic() - begin < 15.0
     pool.shutdown(wait=False)
 

@@ -78,7 +78,7 @@ def test_differences_halve_a_step_that_raises_the_loss():
 def test_what_the_model_tells_is_of_its_search(robot, tmp_path, monkeypatch):
     config = TuneConfig(rollout=BRIEF)
     campaign = Campaign(tmp_path, config, robot, nominal(), {"short": AHEAD}, [hfs()])
-    monkeypatch.setattr(walks, "space_of", lambda pool, campaign: campaign.folder)
+    monkeypatch.setattr(walks, "campaign_space", lambda pool, campaign: campaign.folder)
 
     def folder():
         return race.read_model(None, campaign, searches=False).space

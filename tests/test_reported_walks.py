@@ -519,7 +519,7 @@ def test_points_follow_from_the_weights_where_the_code_places_them_otherwise(wal
     thrice = lambda one: units(one) * np.where(np.arange(len(units(one))) < 18, 1.0, 3.0)  # noqa: E731
     monkeypatch.setattr(campaigns, "_units", thrice)
     one = campaign(walked)
-    space = walks.space_of(HandsOver(), one)
+    space = walks.campaign_space(HandsOver(), one)
     for number, row in enumerate(rows(walked)):
         kept = load_weights(walks.weights_path(walked, number), one.robot)
         again = campaigns.weights_at(one, space, row.point)
@@ -570,7 +570,7 @@ def test_a_folder_of_another_format_says_how_to_begin_anew(folder, robot, capsys
 def test_the_point_of_weights_is_the_one_that_they_came_from(folder):
     next_walk(folder, ("ahead",))
     one = campaign(folder)
-    space = walks.space_of(HandsOver(), one)
+    space = walks.campaign_space(HandsOver(), one)
     for point in POINTS:
         weights = campaigns.weights_at(one, space, point)
         np.testing.assert_allclose(campaigns.point_of(one, space, weights), point, atol=1e-12)

@@ -30,7 +30,7 @@ def test_the_ridges_are_compared_by_the_mean_log_ratio(monkeypatch, tmp_path):
 
     monkeypatch.setattr(ridge, "workers", lambda count: nullcontext())
     monkeypatch.setattr(nets, "load_or_train", lambda *_: SimpleNamespace(params=None))
-    monkeypatch.setattr(tunings, "tune", tune)
+    monkeypatch.setattr(tunings, "tune_all", tune)
     monkeypatch.setattr(judging, "judge", judge)
     words = ["--ridges", "0.0", "0.01", "--plants", "2", "--out", str(tmp_path / "out")]
     monkeypatch.setattr(sys, "argv", ["ridge.py", *words])

@@ -94,7 +94,7 @@ def test_processes_load_the_programs_that_one_of_them_compiled(monkeypatch, tmp_
     with runtime.workers(2) as pool:
         setup = Setup(pool, config, robot)
         tunings.compile_programs(setup, nominal(), straight)
-        tunings.tune(setup, problems, tmp_path / "tunings", title="")
+        tunings.tune_all(setup, problems, tmp_path / "tunings", title="")
         weights = config.rollout.walk.with_others(nominal(), ["friction"])
         jobs = [Job(weights, command, hfs(), 0.1) for (command,), *_ in problems.values()]
         list(walk_many(pool, config.rollout.walk, robot, jobs))

@@ -36,7 +36,7 @@ def _tunings(monkeypatch, folder, flags, robot=ROBOT, config=CONFIG):
         seen.update({name: (setup.config, start, problem) for name, problem in problems.items()})
         return dict.fromkeys(problems, Tuned(pretend_tuning(3, start), ""))
 
-    monkeypatch.setattr(tunings, "tune", tune)
+    monkeypatch.setattr(tunings, "tune_all", tune)
     setup, course = Setup(Executor(), config, robot), (command_of("straight"),)
     run = command._Run(setup, folder, flags, nominal(), course, SimpleNamespace(params=None))
     command._tune_sets(run)

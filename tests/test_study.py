@@ -65,7 +65,7 @@ def asked(monkeypatch):
         params = None
 
     monkeypatch.setattr(nets, "load_or_train", lambda *args: Net)
-    monkeypatch.setattr(searches, "search", search)
+    monkeypatch.setattr(searches, "search_all", search)
     monkeypatch.setattr(tunings, "_tunings", side_by_side)
     monkeypatch.setattr(table_steps, "tune_along_walks", tune_along_walks)
     monkeypatch.setattr(judging, "walk_jobs", walks_of)

@@ -73,7 +73,7 @@ def evaluate(args: Evaluate) -> None:
         )
     verdict = metrics.make_verdict(config.loss, seeds, {trajectory.name: walks.scores})
     title = f"{trajectory.name}, {plural(count, 'plant')}"
-    result = metrics.as_result(verdict, args.world) | {"engine": engine.name}
+    result = metrics.verdict_result(verdict, args.world) | {"engine": engine.name}
     if plant is not None:
         result["plant"] = plant.description.name
         title += f" of {plant.description.name}"
@@ -183,7 +183,7 @@ def grfm(args: Grfm) -> None:
             report_progress(3 * done, 3 * len(worlds), f"{world}: errors")
             start, push = walks.job.start_tick, walks.job.push
             samples, _ = make_dataset(robot, walks.trajectory, start, push=push)
-            errors = training.report(effects, samples)
+            errors = training.errors_by_phi(effects, samples)
             report_progress(3 * done + 1, 3 * len(worlds), f"{world}: errors by phase")
             phases = fidelity.by_phase(effects, samples)
             report_progress(3 * done + 2, 3 * len(worlds), f"{world}: open loop")

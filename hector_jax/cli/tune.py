@@ -47,7 +47,7 @@ from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.evaluate import aligned
 from hector_jax.verdict import choice, judging, metrics
 from hector_jax.verdict.judging import ScoredWalks
-from hector_jax.walk_tuning.walks import Campaign, Row, candidates, changes, tune_on_walks
+from hector_jax.walk_tuning.walks import Campaign, Row, candidates, changes_by_walk, tune_on_walks
 
 _ARTEFACTS = "kept"  # folder in it
 
@@ -134,7 +134,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     config = arguments.with_length(config, trajectories[0])
     start = arguments.weights(args.start, robot)
     data = arguments.data_folder(args.data, args.robot, robot)
-    net = nets.load_net(args.net, robot, args.variant)[0] if args.net else None
+    net = nets.load_trained(args.net, robot, args.variant)[0] if args.net else None
     with workers(args.processes) as pool:
         setup = Setup(pool, config, robot, made_with.get("commit", ""))
         inputs = setup, args.start, start, trajectories, folder / _ARTEFACTS / "hfs"
@@ -148,7 +148,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
             say(f"before any tuning, {trajectories[0].name} on hfs: {line}")
         net = net or nets.load_or_train(pool, robot, data, args.variant)
         run = _Run(setup, folder, args, start, trajectories, net)
-        norms = tunings.gradient_norms(run.setup, run.problems)
+        norms = tunings.mean_norms(run.setup, run.problems)
         if args.alpha == "auto":
             loss = aligned(config.loss, norms["with"])
             say("loss weights: " + ", ".join(f"{term.name} {term.weight:g}" for term in loss))
@@ -170,7 +170,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         determined=known,
         errors=run.net.errors,
         tunings=tuned.tunings,
-        proposals=changes(tuned.proposals),
+        proposals=changes_by_walk(tuned.proposals),
         best_proposal=tuned.best_proposal,
         cases=len(tuned.proposals[0].losses) if tuned.proposals else 0,
         chosen=tuned.chosen,
@@ -242,7 +242,7 @@ def _tune_sets(run: _Run) -> _Tuned:
     config, start = run.answer
     problem = {"best": tunings.Problem(tuple(commands), run.net.params, choice.DRAWS)}
     folder = run.folder / _ARTEFACTS
-    tune_in = partial(tunings.tune, folder=folder, metrics=run.folder / METRICS)
+    tune_in = partial(tunings.tune_all, folder=folder, metrics=run.folder / METRICS)
     title = f"tuning {run.name} without and with GRFM-Net"
     done = tune_in(setup, run.problems, title=title, start=run.start)
     for_best = setup._replace(config=config)
@@ -332,8 +332,8 @@ def _result(
         return metrics.make_verdict(run.setup.config.loss, range(plants[world]), scores)
 
     def content(names: Sequence[str], standin: metrics.Verdict) -> dict[str, Any]:
-        result = metrics.as_result(standin)
-        for name, on_hfs in metrics.as_result(verdict(names, 1), "hfs")["sets"].items():
+        result = metrics.verdict_result(standin)
+        for name, on_hfs in metrics.verdict_result(verdict(names, 1), "hfs")["sets"].items():
             result["sets"][name] |= on_hfs
         return result
 
@@ -344,7 +344,7 @@ def _result(
         by_name |= {name: verdict([name], 0) for name in names}
         result["trajectories"] = {name: content([name], by_name[name]) for name in names}
     if tuned.proposals:
-        result["walks"] = [change._asdict() for change in changes(tuned.proposals)]
+        result["walks"] = [change._asdict() for change in changes_by_walk(tuned.proposals)]
         result["best_of_walks"] = tuned.best_proposal
     result["chosen"] = tuned.chosen
     directions = [direction._asdict() for direction in known.directions]

@@ -249,7 +249,7 @@ def signature(example: tuple) -> dict[str, Any]:
     return _with_shapes(_SIGNATURE, dict(zip(_SIGNATURE, example, strict=False)))
 
 
-class Record(NamedTuple):
+class WalkRecord(NamedTuple):
     """Inputs and outputs of the live controller along a walk, a row for each millisecond.
 
     The first `lead` rows are before t = 0, where the anchor is `standing`; from then on it is
@@ -267,7 +267,7 @@ class Record(NamedTuple):
 
 def record(
     config: WalkConfig, robot: Robot, weights: Weights, *, command: Command, seconds: float
-) -> Record:
+) -> WalkRecord:
     """Walk in the ideal world and record the inputs and outputs of the controller.
 
     Raises:
@@ -305,7 +305,7 @@ def record(
         return lax.scan(measure, jnp.zeros(()), rows)[1]
 
     host = partial(jax.tree.map, np.asarray)
-    return Record(
+    return WalkRecord(
         measurement=host(measurements(np.stack(rows[:-1]))),
         command=command,
         standing=host(standing_anchor(robot)),
@@ -327,8 +327,8 @@ class Check(NamedTuple):
     hold_ms: dict[str, float]  # [ms] of a call that holds the plan
 
 
-def check(
-    config: WalkConfig, control: Callable[..., tuple], example: tuple, recorded: Record
+def compare_with_live(
+    config: WalkConfig, control: Callable[..., tuple], example: tuple, recorded: WalkRecord
 ) -> Check:
     """Run an exported controller along a recorded walk and time it, with NumPy inputs and outputs.
 
@@ -370,7 +370,7 @@ def check(
     )
 
 
-def as_arrays(recorded: Record) -> dict[str, Any]:
+def as_arrays(recorded: WalkRecord) -> dict[str, Any]:
     """Return a record as named arrays, to check the controller on the computer of the robot."""
     groups = {
         "measured": _measured(recorded.measurement),

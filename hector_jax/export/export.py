@@ -27,7 +27,7 @@ from hector_jax.core.tree_file import tree_hash
 from hector_jax.export.controller import (
     Check,
     as_arrays,
-    check,
+    compare_with_live,
     controller,
     export_controller,
     load_controller,
@@ -143,7 +143,7 @@ def export(
     blobs = {p: export_controller(config, robot, weights, platform=p) for p in PLATFORMS}
     recorded = record(config, robot, weights, command=command, seconds=seconds)
     _, example = controller(config, robot, weights)
-    result = check(config, load_controller(blobs["cpu"]), example, recorded)
+    result = compare_with_live(config, load_controller(blobs["cpu"]), example, recorded)
     _require_same(result)
     # the card has the hashes of the other files: it is removed first and written last
     (folder / "controller.json").unlink(missing_ok=True)

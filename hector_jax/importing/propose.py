@@ -59,7 +59,7 @@ _NAMES = ("name", "model", "standing", "joints", "feet")  # what is found, not r
 _ARMATURE_PER_LIMIT = 2e-4  # [s^2]: HECTOR's has 2.4e-4, Unitree's robots 1e-4 to 4e-4
 
 
-class Proposal(NamedTuple):
+class RobotProposal(NamedTuple):
     """The proposed TOML of a file, as far as its rules go."""
 
     table: dict[str, Any]
@@ -72,7 +72,7 @@ class Proposal(NamedTuple):
 
 
 @quiet_mujoco()
-def propose(path: Path) -> Proposal:
+def propose_robot(path: Path) -> RobotProposal:
     """Return the proposed TOML of a model's file, or of a TOML file with what it leaves out.
 
     Raises:
@@ -86,7 +86,7 @@ def propose(path: Path) -> Proposal:
             description_of(path, own)  # refuses it
     wrong, error = [], None
     stem = "".join(x if x.isalnum() or x in "-_" else "-" for x in path.stem)
-    found = Proposal({"name": stem, **own}, (), [])
+    found = RobotProposal({"name": stem, **own}, (), [])
     try:
         named = _named_legs(path, own)
         if not (named and "feet" in own and "standing" in own):
@@ -108,7 +108,7 @@ def propose(path: Path) -> Proposal:
     return found._replace(wrong=tuple(wrong), filled=_left_out(found.table, own), error=error)
 
 
-def standard_form(proposal: Proposal, model: str) -> tuple[dict[str, Any], str]:
+def standard_form(proposal: RobotProposal, model: str) -> tuple[dict[str, Any], str]:
     """Return TOML table and MJCF of a proposed robot in the standard form, which has all names.
 
     Args:
@@ -134,7 +134,7 @@ def _named_legs(path: Path, own: dict[str, Any]) -> list[tuple[str, ...]]:
     return list(from_table(f"{path}: joints", Joints, joints).legs.values())
 
 
-def _with_legs(survey: Survey, found: Proposal) -> Proposal:
+def _with_legs(survey: Survey, found: RobotProposal) -> RobotProposal:
     """Return a proposal with the legs of a survey; what its table has stays."""
     legs = zip(FEET[len(survey.legs)], survey.legs, strict=True)
     joints: dict[str, Any] = {x: [survey.model.joint(j).name for j in leg] for x, leg in legs}
@@ -142,7 +142,7 @@ def _with_legs(survey: Survey, found: Proposal) -> Proposal:
     return found._replace(survey=survey, table=_merged({"joints": joints}, found.table))
 
 
-def _with_feet(found: Proposal, wrong: list[str]) -> Proposal:
+def _with_feet(found: RobotProposal, wrong: list[str]) -> RobotProposal:
     """Return a proposal with feet and standing angles; what its table has stays."""
     survey = found.survey
     assert survey is not None

@@ -55,7 +55,7 @@ def claims(cells: Cells, differs: Mapping[str, str], family: str) -> dict[str, l
     pairs = [(n, b) for n in names for b in BASELINES if b in names and b != n]
     pairs = [(n, b) for n, b in pairs if n not in BASELINES] or pairs[-1:]
     seeds = {column: verdict.seeds for (column, _), verdict in cells.items()}
-    changes = {pair: matrix.changes(cells, *pair) for pair in pairs}
+    changes = {pair: matrix.changes_by_cell(cells, *pair) for pair in pairs}
     fill = partial(
         render,
         matrix=matrix,
@@ -146,7 +146,7 @@ def write_report(
         "config": dict(config),
         "environment": dict(environment),
     }
-    result = matrix.as_result(cells, family) | {"differs": dict(differs), **contents}
+    result = matrix.matrix_result(cells, family) | {"differs": dict(differs), **contents}
     picture = Picture("verdict.png", plots.matrix(folder / "verdict.png", cells, title_of))
     text = render(
         "matrix.md.j2",

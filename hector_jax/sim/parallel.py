@@ -130,7 +130,7 @@ def _millisecond(
     contacts = jax.tree.map(widen, mjx_model.mjx_contacts(data))
     floor, foot_of_geom = jnp.asarray(places.floor), jnp.asarray(places.foot_of_geom)
     ground = sensing.ground_of(contacts, floor, foot_of_geom, len(robot.foot_point))
-    effect, touches = loop.effect_of(robot, before, ground), ground.touches
+    effect, touches = loop.contact_effect(robot, before, ground), ground.touches
     reading = sensing.unpack_reading(_read(program, walk, physics))
     fell = has_fallen(sensing.base_state(robot, reading, yaw), *robot.description.limits)
     fallen = carry.fallen | fell | touches.floor | mjx_model.in_floor(places, walk.model, data)

@@ -78,7 +78,7 @@ def _samples(
             time=time,
             yaw=yaw,
             after=after,
-            effect=loop.effect_of(robot, before, ground),
+            effect=loop.contact_effect(robot, before, ground),
             touches=ground.touches,
         )
 

@@ -83,7 +83,7 @@ def collection_settings(config: CollectConfig, robot: Robot) -> dict[str, Any]:
     }
 
 
-def collect(pool: Executor, config: CollectConfig, robot: Robot, folder: Path) -> None:
+def collect_walks(pool: Executor, config: CollectConfig, robot: Robot, folder: Path) -> None:
     """Walk on drawn hfs plants and save the walks under `folder`, continuing from those in it.
 
     Raises:
@@ -108,7 +108,7 @@ def collect(pool: Executor, config: CollectConfig, robot: Robot, folder: Path) -
             )
 
 
-class Samples(NamedTuple):
+class SampleSets(NamedTuple):
     """Samples of a collection; no walk is in two of the parts."""
 
     training: dataset.Dataset
@@ -117,12 +117,12 @@ class Samples(NamedTuple):
     dropped: int  # number of samples dropped for a fall, an unsolved QP or a push
 
 
-def samples(robot: Robot, folder: Path) -> Samples:
+def samples(robot: Robot, folder: Path) -> SampleSets:
     """Return samples of the walks under a folder: 1/5 held out, 1/5 of the rest for validation."""
     job, walk = collection.load_walks(folder, robot)
     data, dropped = dataset.make_dataset(robot, walk, job.start_tick, push=job.push)
     rest, held_out = dataset.split_by_walk(data)
-    return Samples(*dataset.split_by_walk(rest, seed=1), held_out, dropped)
+    return SampleSets(*dataset.split_by_walk(rest, seed=1), held_out, dropped)
 
 
 def held_out_walks(robot: Robot, net: TrainedNet) -> collection.Walks:
@@ -132,7 +132,7 @@ def held_out_walks(robot: Robot, net: TrainedNet) -> collection.Walks:
     return jax.tree.map(lambda x: x[net.held_out_walks], walks)
 
 
-def train(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> TrainedNet:
+def train_net(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> TrainedNet:
     """Train a GRFM-Net on the walks under `folder` and save it at `path`.
 
     Its card describes its walks and their controller.
@@ -155,7 +155,7 @@ def _train(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Train
     with say_if_slow("computing the errors on held-out walks"):
         linear = fit_linear(parts.training)
         effects = {"raw": last_command, "linear": as_effect(linear), "net": as_effect(params)}
-        errors = training.report(effects, parts.held_out)
+        errors = training.errors_by_phi(effects, parts.held_out)
     if parts.held_out.lands.any() and errors["net"]["touchdown"] == errors["raw"]["touchdown"]:
         say(
             f"{robot.description.path}: tuning.touchdown_error: the net {config.variant} does not "
@@ -181,7 +181,7 @@ def net_path(data: Path, variant: str) -> Path:
     return data / ("grfm.npz" if variant == TrainConfig.variant else f"grfm-{variant}.npz")
 
 
-def load_net(path: Path, robot: Robot, variant: str) -> tuple[TrainedNet, dict[str, Any]]:
+def load_trained(path: Path, robot: Robot, variant: str) -> tuple[TrainedNet, dict[str, Any]]:
     """Load a net from a file, with the description of its training from its card.
 
     Returns:
@@ -193,7 +193,7 @@ def load_net(path: Path, robot: Robot, variant: str) -> tuple[TrainedNet, dict[s
     params, _, card = network.load_net(path, robot, variant)
     about = card["about"]
     try:
-        structure = jax.tree.structure(network.layout("linear", (), walk_config(robot)))
+        structure = jax.tree.structure(network.empty_params("linear", (), walk_config(robot)))
         linear = jax.tree.unflatten(structure, map(np.array, about["linear"]))
         held_out = list(about["held_out"])
         settings, made_of = dict(about["settings"]), dict(about["made_of"])
@@ -235,13 +235,13 @@ def load_or_train(
     walks, path = data / "walks", net_path(data, config.variant)
     settings = collection_settings(CollectConfig(), robot)
     if not (walks / "card.json").exists():
-        collect(pool, CollectConfig(), robot, walks)
+        collect_walks(pool, CollectConfig(), robot, walks)
     made_of = collection.fingerprint(walks)
     check_settings(walks, {name: made_of.get(name) for name in settings}, settings)
     with locked(data):  # a second process waits here, and then loads the net
         if not path.exists():
             return _train(config, robot, walks, path)
-    net, inputs = load_net(path, robot, config.variant)
+    net, inputs = load_trained(path, robot, config.variant)
     check_settings(path, inputs["settings"], training_settings(config, robot))
     check_settings(path, inputs["made_of"], made_of)
     return net._replace(folder=walks)

@@ -226,7 +226,7 @@ def _tunings(
                 yield running.pop(future), Tuned(future.result(), setup.commit)
 
 
-def tune(
+def tune_all(
     setup: Setup,
     problems: Mapping[str, Problem],
     folder: Path,
@@ -289,7 +289,7 @@ def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, 
     return jax.tree.map(lambda *x: float(np.mean(x)), *results)
 
 
-def gradient_norms(setup: Setup, problems: Mapping[str, Problem]) -> dict[str, dict[str, float]]:
+def mean_norms(setup: Setup, problems: Mapping[str, Problem]) -> dict[str, dict[str, float]]:
     """Return norms of the gradients of the loss terms at nominal weights, means over commands."""
     with bar("norms of the gradients") as report_progress:
         pool, config, robot, _ = setup
@@ -298,7 +298,7 @@ def gradient_norms(setup: Setup, problems: Mapping[str, Problem]) -> dict[str, d
         return {name: future.result() for name, future in running.items()}
 
 
-def gauss_newton(setup: Setup, start: Weights, problem: Problem) -> Float[np.ndarray, "n n"]:
+def relative_matrix(setup: Setup, start: Weights, problem: Problem) -> Float[np.ndarray, "n n"]:
     """Return the Gauss-Newton matrix divided by the loss, mean over the commands."""
     objective = _objective(setup, start, problem)
     return np.asarray(objective.matrix(start)) / float(objective.evaluate(start).loss)
@@ -321,7 +321,7 @@ def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
     """
     problems = {name: Problem((named_command(name),), None) for name in COMMANDS}
     title = "tuning paths on the rigid body, for the data"
-    tuned = tune(Setup(pool, tune_config(robot), robot), problems, folder, title=title)
+    tuned = tune_all(Setup(pool, tune_config(robot), robot), problems, folder, title=title)
     histories = [tuned[name].tuning.iterations for name in COMMANDS]
     return [stack([i.weights for i in history if i.accepted]) for history in histories]
 

@@ -78,14 +78,14 @@ def gauss_newton(
     Returns:
         The matrix in the n coordinates of `parameters.stepped`.
     """
-    return matrix(partial(walk, config, scenario), weights, loss, others)
+    return gauss_newton_of(partial(walk, config, scenario), weights, loss, others)
 
 
 gauss_newton_jit = jax.jit(gauss_newton, static_argnums=0, static_argnames=("walk", "others"))
 """`gauss_newton`, compiled once per rollout and set of terms."""
 
 
-def matrix(
+def gauss_newton_of(
     walk: Callable[[Weights], Trajectory],
     weights: Weights,
     loss: Loss,

@@ -22,7 +22,7 @@ from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
 from hector_jax.robot.model import Robot
-from hector_jax.tuning.curvature import matrix
+from hector_jax.tuning.curvature import gauss_newton_of
 from hector_jax.tuning.evaluate import Evaluation, evaluation
 from hector_jax.tuning.loss import Loss
 from hector_jax.tuning.rollout import (
@@ -160,4 +160,4 @@ def grounded_matrix(
     others: tuple[str, ...] = (),
 ) -> Float[Array, "n n"]:
     """Compute the Gauss-Newton matrix of a grounded rollout; see `curvature.gauss_newton`."""
-    return matrix(partial(grounded_rollout, config, grounding), weights, loss, others)
+    return gauss_newton_of(partial(grounded_rollout, config, grounding), weights, loss, others)

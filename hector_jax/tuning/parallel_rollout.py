@@ -35,13 +35,13 @@ from hector_jax.tuning.rollout import (
     Carry,
     RolloutConfig,
     Scenario,
-    from_start,
     init_carry,
     step_carry,
     varied,
     walked_ticks,
     with_constants,
     with_variation,
+    without_lead,
 )
 
 
@@ -197,4 +197,4 @@ def parallel_rollout(config: RolloutConfig, scenario: Scenario, weights: Weights
         fallen=~standing(steps.outputs[:, :size]),  # as in `_newton`
         residual=jnp.where(converged, steps.sample.residual, jnp.inf),
     )
-    return from_start(config, samples)
+    return without_lead(config, samples)

@@ -252,7 +252,7 @@ def walked_ticks(config: RolloutConfig, anchor: Anchor) -> Int[Array, " ticks"]:
     return anchor.tick - config.lead + jnp.arange(config.lead + config.ticks)
 
 
-def from_start(config: RolloutConfig, samples: Trajectory) -> Trajectory:
+def without_lead(config: RolloutConfig, samples: Trajectory) -> Trajectory:
     """Cut the samples of all ticks to the trajectory from t = 0 on."""
     initial = jax.tree.map(lambda x: x[config.lead], samples.initial)
     walk = jax.tree.map(lambda x: x[config.lead :], samples)
@@ -303,4 +303,4 @@ def rollout(config: RolloutConfig, scenario: Scenario, weights: Weights) -> Traj
         padded = ticks[0] + jnp.arange(blocks * size).reshape(blocks, size)
         _, (samples, to_samples) = jax.lax.scan(jax.checkpoint(walk), start, padded)
         samples = samples.reshape(-1, samples.shape[-1])[: len(ticks)]
-    return from_start(config, to_samples(samples))
+    return without_lead(config, to_samples(samples))

@@ -103,14 +103,14 @@ def sets_of(cells: Cells) -> list[str]:
     return list(next(iter(cells.values())).scores)
 
 
-def changes(cells: Cells, name: str, baseline: str) -> dict[tuple[Column, str], Comparison]:
+def changes_by_cell(cells: Cells, name: str, baseline: str) -> dict[tuple[Column, str], Comparison]:
     """Compare a set with a baseline in every cell."""
     return {cell: metrics.compare(verdict, name, baseline) for cell, verdict in cells.items()}
 
 
 def tally(cells: Cells, name: str, baseline: str) -> Tally:
     """Count the cells in which a set is below a baseline."""
-    comparisons = changes(cells, name, baseline).values()
+    comparisons = changes_by_cell(cells, name, baseline).values()
     intervals = [comparison.change["L"] for comparison in comparisons if comparison.counts]
     return Tally(
         cells=len(cells),
@@ -192,7 +192,7 @@ def _losses_on_shared_seeds(verdicts: Sequence[Verdict]) -> list[dict[str, np.nd
     return [{name: score.L[at] for name, score in v.scores.items()} for v, at in inputs]
 
 
-def as_result(cells: Cells, family: str) -> dict[str, Any]:
+def matrix_result(cells: Cells, family: str) -> dict[str, Any]:
     """Return all columns as JSON values: the content of verdict.json.
 
     `columns` is a list of `engine`, `model`, `seeds` and `trajectories.<name>`, each as the `sets`
@@ -226,7 +226,7 @@ def as_result(cells: Cells, family: str) -> dict[str, Any]:
 def _cell(verdict: Verdict) -> dict[str, Any]:
     """Return the sets of a verdict as JSON values."""
     sets = {}
-    for name, worlds in metrics.as_result(verdict)["sets"].items():
+    for name, worlds in metrics.verdict_result(verdict)["sets"].items():
         row, score = worlds["standin"], verdict.scores[name]
         row["falls_share"] = fall_share(row["falls"], len(verdict.seeds))._asdict()
         row["fallen_by_seed"] = score.fallen[:, 0].tolist()

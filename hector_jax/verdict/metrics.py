@@ -242,7 +242,7 @@ def family_of(world: str) -> str | None:
     return (family or name) if name == "standin" else None
 
 
-def as_result(verdict: Verdict, world: str = "standin") -> dict[str, Any]:
+def verdict_result(verdict: Verdict, world: str = "standin") -> dict[str, Any]:
     """Return the verdict as JSON values: the content of result.json.
 
     `family` is that of the plants; results without this key are of the family `standin`.

@@ -25,7 +25,7 @@ def read_reports(pool: Executor, campaign: Campaign) -> list[walks.Row]:
     Raises:
         InputError: see `walks.read_history`; or the weights or a log of a walk are damaged.
     """
-    rows, space = walks.read_history(campaign), walks.space_of(pool, campaign)
+    rows, space = walks.read_history(campaign), walks.campaign_space(pool, campaign)
     for number, old in enumerate(rows):
         weights = load_weights(walks.weights_path(campaign.folder, number), campaign.robot)
         point = point_of(campaign, space, weights)

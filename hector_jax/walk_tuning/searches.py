@@ -16,7 +16,7 @@ from hector_jax.core.inputs import plural
 from hector_jax.core.trajectory import SOLVED
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.search import cmaes
-from hector_jax.search.cmaes import Generation, SearchConfig, SearchResult, best
+from hector_jax.search.cmaes import Generation, SearchConfig, SearchResult, best_point
 from hector_jax.sim.engine import Engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
@@ -57,7 +57,7 @@ def losses_on_hfs(
     return {name: group[:, 0] for name, group in by_name.items()}
 
 
-def search(
+def search_all(
     setup: Setup,
     config: SearchConfig,
     start: Weights,
@@ -99,7 +99,9 @@ def search(
 
         def on_generation(histories: Mapping[str, list[Generation]]) -> None:
             done = sum(map(len, histories.values())) * config.population
-            lowest = [f"{n} {best(rows)[1] / 1e6:.3f}e6" for n, rows in histories.items() if rows]
+            lowest = [
+                f"{n} {best_point(rows)[1] / 1e6:.3f}e6" for n, rows in histories.items() if rows
+            ]
             remark = "lowest L: " + ", ".join(lowest) if done else "compiling"
             report_progress(done, config.generations * size, remark)
 

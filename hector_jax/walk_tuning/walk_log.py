@@ -167,7 +167,7 @@ def _reference_of(tick: float, robot: Robot, command: Command, log: Log) -> Stat
     return jax.vmap(lambda t: reference_at(tick, command, anchor, t))(ticks)
 
 
-def tracking(config: TuneConfig, robot: Robot, command: Command, log: Log) -> dict[str, Any]:
+def tracking_errors(config: TuneConfig, robot: Robot, command: Command, log: Log) -> dict[str, Any]:
     """Return how a log of 1 ms tracks a command, as JSON values in SI units.
 
     RMS errors and `seconds` are up to a fall, of one sample at least.

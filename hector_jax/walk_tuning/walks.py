@@ -123,7 +123,7 @@ def row_of(proposal: Proposal, cases: Sequence[ScoredLog]) -> Row:
 # The folder
 
 
-def space_of(pool: Executor, campaign: Campaign) -> Space:
+def campaign_space(pool: Executor, campaign: Campaign) -> Space:
     """Return the coordinates of all points, from their file or from the model at the start.
 
     Raises:
@@ -134,7 +134,7 @@ def space_of(pool: Executor, campaign: Campaign) -> Space:
     if not path.exists():
         problem = tunings.Problem(tuple(campaign.commands.values()), None)
         setup = Setup(pool, campaign.config, campaign.robot)
-        matrix = tunings.gauss_newton(setup, campaign.start, problem)
+        matrix = tunings.relative_matrix(setup, campaign.start, problem)
         save_tree(path, {"matrix": matrix}, kind="metric", robot=campaign.robot)
     tree, _ = load_tree(path, {"matrix": np.zeros((0, 0))}, kind="metric", robot=robot)
     return few_walks.space_of(tree["matrix"], box_of(campaign))
@@ -321,7 +321,7 @@ def answer(campaign: Campaign, space: Space, rows: Sequence[Row]) -> tuple[Weigh
 
 def candidates(pool: Executor, campaign: Campaign, rows: Sequence[Row]) -> dict[str, Weights]:
     """Return the start, each set that was 1 % better than all before it, and that of `answer`."""
-    space, history = space_of(pool, campaign), _walked(rows)
+    space, history = campaign_space(pool, campaign), _walked(rows)
     losses = np.array([result.loss for result in history])
     better = losses[1:] < np.minimum.accumulate(losses)[:-1] - few_walks.GAIN
     numbers = {0, *(1 + np.flatnonzero(better)), few_walks.incumbent(space, history)}
@@ -340,7 +340,11 @@ def tune_on_walks(pool: Executor, campaign: Campaign, walks: int) -> list[Row]:
     Raises:
         InputError: see `next_proposal` and `read_history`.
     """
-    rows, space, cases = read_history(campaign), space_of(pool, campaign), len(campaign.cases)
+    rows, space, cases = (
+        read_history(campaign),
+        campaign_space(pool, campaign),
+        len(campaign.cases),
+    )
     with bar(f"tuning with {plural(walks, 'walk')}") as report_progress:
         while not rows or (_stood(rows[0]) and (len(rows) + 1) * cases <= walks):
             report_progress(len(rows) * cases, walks, _progress(campaign, space, rows))
@@ -368,7 +372,7 @@ class Change(NamedTuple):
     change: float | None  # [%] of L; None where the robot fell or a QP was not solved
 
 
-def changes(rows: Sequence[Row]) -> list[Change]:
+def changes_by_walk(rows: Sequence[Row]) -> list[Change]:
     """Return the result of each proposal."""
 
     def percent(loss: float | None) -> float | None:
@@ -381,7 +385,7 @@ def _progress(campaign: Campaign, space: Space, rows: Sequence[Row]) -> str:
     if not rows:
         return "compiling"
     best = few_walks.best_walk(_walked(rows))
-    change = f"best L {changes(rows)[best].change or 0.0:+.0f} % against the start"
+    change = f"best L {changes_by_walk(rows)[best].change or 0.0:+.0f} % against the start"
     weights = weights_at(campaign, space, rows[best].point)
     logs = np.asarray(steps_between(campaign.start, weights))
     moved = sorted(zip(direction_names(weights), logs, strict=True), key=lambda x: -abs(x[1]))[:3]
