@@ -59,8 +59,8 @@ def _section(name: str, kind: type[Any]) -> str:
     text, _, example = (inspect.getdoc(kind) or "").replace("\n", " ").partition("Example: ")
     rows = [f"## hector {name}", "", " ".join(text.split()), "", f"    {example}"]
     own = inspect.get_annotations(kind)
-    flags = [field for field in fields(kind) if field.name in comments]
-    flags.sort(key=lambda field: field.name not in own)  # those of all commands last
+    # those of all commands last
+    flags = sorted(fields(kind), key=lambda field: field.name not in own)
     if flags:
         rows += ["", "| flag | what it does | default |", "|---|---|---|"]
     for field in flags:
