@@ -326,12 +326,19 @@ def limits():
     walked = 4 * len(sets("s")["best"]["seeds"])
     yield f"for {touch[0]:.1f} s of {walked} s, with `nominal` for {touch[1]:.1f} s"
     cells = report("robustness/robustness.json")["cells"]
-    pushed = [one["sets"] for one in cells if one["level"] == "push 125 N"]
-    slippery = [c["sets"] for c in cells if (c["traj"], c["level"]) == ("s", "friction 0.3")]
-    for chosen, text in (
-        (pushed, "Under 125 N `best` falls in {} of {} walks, and `nominal` in {}"),
-        (slippery, "friction 0.3 both fall in most walks: `best` in {} of {}, `nominal` in {}"),
+    scenes = {f"{c['traj']} {c['world']} {c['level']}": c["sets"] for c in cells}
+    for pattern, text in (
+        (".* push 125 N", "Under 125 N `best` falls in {} of {} walks, and `nominal` in {}"),
+        (
+            "s standin push (50|75|100) N",
+            "Under 50 to 100 N on S `best` falls in {} of {} walks of the stand-in, `nominal` in {}",
+        ),
+        (
+            "s .* friction 0.3",
+            "friction 0.3 both fall in most walks: `best` in {} of {}, `nominal` in {}",
+        ),
     ):
+        chosen = [one for name, one in scenes.items() if re.fullmatch(pattern, name)]
         walks, falls = (
             {name: sum(one[name][what] for one in chosen) for name in ("best", "nominal")}
             for what in ("walks", "falls")
