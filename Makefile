@@ -37,22 +37,21 @@ tune: $(STAMP) ## tune and evaluate: make tune TRAJ=straight|c|s|all, TRAJ="c s"
 
 TABLE := runs/table$(if $(QUICK),/quick)
 MODELS := --light-heavy --plant examples/hector-v2/robot.toml
-SHARED_MEAN := shared_mean=docs/batch/shared/weights/shared_mean.json
 
 table: $(STAMP) ## all sets on 32 plants and their verdict in all engines, into runs/table; QUICK=1 for a trial
 	@$(BIN)/python experiments/table.py $(if $(QUICK),--quick)
 	@$(BIN)/hector verdict --engine all $(if $(QUICK),--seeds 1 --engine-seeds 1,$(MODELS)) --out $(TABLE)/verdict \
-		--weights nominal expert $(SHARED_MEAN) $(foreach set,without with search_200,$(set)=$(TABLE)/weights/$(set))
+		--weights nominal expert best $(foreach set,without with search_200,$(set)=$(TABLE)/weights/$(set))
 
-verdict: $(STAMP) ## sets in all engines and models: make verdict WEIGHTS="nominal expert mine.json"
-	@$(BIN)/hector verdict --engine all $(MODELS) --weights $(or $(WEIGHTS),nominal expert $(SHARED_MEAN))
+verdict: $(STAMP) ## sets in all engines and models: make verdict WEIGHTS="nominal mine.json"
+	@$(BIN)/hector verdict --engine all $(MODELS) --weights $(or $(WEIGHTS),nominal expert best)
 
 grfm: $(STAMP) ## how well the nets predict the ground forces: runs/grfm/report.md
 	@$(BIN)/hector grfm
 
 search: $(STAMP) ## search of 2000 walks for each trajectory; continues if interrupted; for a GPU
 	@$(BIN)/hector search --traj all --budget 2000 --population 40 --record runs/search_2000 \
-		--out docs/results/search_2000
+		--out experiments/reports/search_2000
 
 test: $(STAMP) ## the fast tests
 	@$(BIN)/pytest -q -n 2 --dist loadfile

@@ -4,7 +4,7 @@
 on the high-fidelity simulator, one trajectory each. All search in the box of the weights, rivals
 within 3 of the start in log-weights or 4 in the metric of the model.
 
-    python experiments/race.py --traj s --start nominal docs/batch/shared/weights/shared_mean.json
+    python experiments/race.py --traj s --start nominal assets/hector-best.json
 
 Each contest is a tuning of its own with a folder under OUT/contests; a later call continues there,
 with more methods or walks too. At the end the best set of each at some budgets walks on plants that

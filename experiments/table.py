@@ -68,7 +68,7 @@ class Flags(Configured):
     step_plants: Annotated[int, Range(1, 1000)] = 8  # simulator plants for each of these steps
     extra: tuple[str, ...] = ()  # more rows, NAME=FOLDER of straight.json, c.json and s.json
     # folder of row `search_2000`, if it exists
-    search_2000: Path = Path("docs/results/search_2000")
+    search_2000: Path = Path("experiments/reports/search_2000")
     earlier: Path | None = None  # table.json of other plants, to compare the order of the sets
     data: Folder = Path("data")  # folder of the walks and the net, which are made if missing
     out: Folder = Path("runs/table")  # folder for the report

@@ -25,7 +25,7 @@ from hector_jax.verdict.metrics import score
 HECTOR = load_robot()
 CONFIG = walk_config(HECTOR)
 WORLDS = {"ideal": ideal, "hfs": hfs}
-NAMES = ("shared_mean", "c-alone")
+NAMES = ("without", "with")
 ROOT = Path(__file__).parents[1]
 FILES = [None, *(ROOT / "examples" / name / "robot.toml" for name in ("humanoid", "quadruped"))]
 
@@ -164,7 +164,7 @@ def test_an_engine_that_fails_says_so_and_stays_so(engine):
 
 @pytest.mark.slow
 def test_four_sets_rank_as_in_mujoco(engine):
-    folder = ROOT / "docs" / "batch" / "shared" / "weights"
+    folder = ROOT / "experiments" / "reports" / "best"
     sets = [nominal(), expert(), *(load_weights(folder / f"{n}.json") for n in NAMES)]
     ranks = [
         np.argsort([score(PAPER_LOSS, walk(CONFIG, HECTOR, one, build=build)).L for one in jobs])

@@ -255,7 +255,7 @@ def test_another_factor_or_order_would_be_noticed(spoilt):
 
 def test_the_page_says_what_the_cpp_controller_lacks_and_the_header_our_numbers():
     text = weights_cpp(nominal(), CONFIG, ROBOT, name="nominal")
-    page = (Path(__file__).parents[1] / "docs" / "export.md").read_text()
+    page = (Path(__file__).parents[1] / "docs" / "export-cpp.md").read_text()
     for fact in (
         "0.04 s",
         "9.0 kg",
@@ -266,7 +266,7 @@ def test_the_page_says_what_the_cpp_controller_lacks_and_the_header_our_numbers(
         "M_z",
     ):
         assert fact in page
-    for fact in ("steps of 0.03 s, 10 of them", "F_z <= M_y <=", "docs/export.md"):
+    for fact in ("steps of 0.03 s, 10 of them", "F_z <= M_y <=", "docs/export-cpp.md"):
         assert fact in text
     assert "ATTENTION" not in text
     about_weight = WalkConfig(mpc=MpcConfig(effort_reference="gravity"))

@@ -172,7 +172,7 @@ def examine_robot(args: flags.Robot) -> None:
             "left out", [f"{', '.join(proposal.filled)}: HECTOR's, below by the rules"]
         )
     print("\n".join([*lines, *section("wrong", [*told, *wrong])]))
-    head = f"Proposed by `hector robot {file.name}`; rules: docs/howto/robot.md."
+    head = f"Proposed by `hector robot {file.name}`; rules: docs/robot-toml.md."
     comments = [head, *(f"To be mended: {line}" for line in [*told, *wrong] if wrong)]
     if out is not None:
         _write_robot(out, proposal, comments, file)

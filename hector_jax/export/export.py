@@ -213,8 +213,8 @@ _HEADER = """\
 // Both controllers minimise sum |x - x_ref|^2_Q + |u|^2_Alpha, world frame, in SI; the numbers go
 // over as they are. They were tuned with {mass:.4g} kg, steps of {dt:g} s, {horizon} of them,
 // |F_x| + |F_y| <= {mu:g} F_z <= {limit:g} N, -{toe:.3g} F_z <= M_y <= {heel:.3g} F_z, M_x = 0,
-// friction at toe and heel: {line}. What differs in the C++ controller is in docs/export.md of
-// hector_jax: read it before walking.
+// friction at toe and heel: {line}. What differs in the C++ controller is in docs/export-cpp.md
+// of hector_jax: read it before walking.
 """
 _ATTENTION = """\
 // ATTENTION: R prices u less the feet's share of the weight here, u itself there: Alpha was not
