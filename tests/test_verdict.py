@@ -337,9 +337,11 @@ def test_wrong_input_is_one_line_before_anything_is_walked(
 def test_walks_of_models_and_trajectories_with_hyphens_are_told_apart():
     walks = {name: (NamedCommand(name, named_command("s")), 1.0) for name in ("y-z", "z")}
     sets = {name: {"nominal": nominal()} for name in walks}
-    models = {"x": command.Model(), "x-y": command.Model(mass=1.1)}
+    models = {"x": command.PlantModel(), "x-y": command.PlantModel(mass=1.1)}
     columns = {Column("c", model): range(1) for model in models}
-    plan = command.Plan(load_robot(), "standin", walks, sets, models, columns, {"c": MUJOCO_C})
+    plan = command.VerdictPlan(
+        load_robot(), "standin", walks, sets, models, columns, {"c": MUJOCO_C}
+    )
     assert len(command._jobs(plan, "c")) == 4
 
 

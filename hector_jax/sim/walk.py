@@ -37,8 +37,6 @@ from hector_jax.sim.plant import BuildPlant, Plant
 from hector_jax.sim.sensing import Ground
 from hector_jax.sim.world import push_force
 
-_measure = jax.jit(sensing.measure)
-
 
 @jax.jit
 def _begin(robot: Robot, reading: Array) -> Memory:
@@ -164,7 +162,6 @@ def walk(
     job: Job,
     *,
     build: BuildPlant = MujocoPlant,
-    retune: Callable[..., Weights] | None = None,
 ) -> Trajectory:
     """Walk once, by default in MuJoCo C.
 
@@ -173,9 +170,6 @@ def walk(
         robot: its nominal robot; the plant is its MJCF, or that of the job.
         job: the walk.
         build: builds the plant in an engine.
-        retune: returns the weights of plans and legs at each tick from t = 0 on, instead of the
-            job's, from gait tick, anchor, measurement and the wrench commanded over the previous
-            tick; called for up to nine ticks after a fall too.
 
     Returns:
         Samples of 1 ms from t = 0 (numpy). After a fall they repeat the last valid sample and are
@@ -188,7 +182,7 @@ def walk(
     count, ticks = substeps(config), loop.walk_ticks(config, job.seconds, job.start_tick)
     lead, length = (job.start_tick - first_tick(config)) * count, ticks * count
     plant = build(job, job.body(robot), -lead, length)
-    blocks = zip(*_walk_blocks(config, robot, job, plant, ticks=ticks, retune=retune), strict=True)
+    blocks = zip(*_walk_blocks(config, robot, job, plant, ticks=ticks), strict=True)
     plan, flat = (jax.tree.map(lambda *x: np.concatenate(x), *trees) for trees in blocks)
     # from a fall on, samples repeat the last valid one
     fell, good = np.flatnonzero(flat.fallen), len(flat.fallen) - 1
@@ -205,7 +199,7 @@ def walk(
 
 
 def _walk_blocks(
-    config: WalkConfig, robot: Robot, job: Job, plant: Plant, *, ticks: int, retune: Any
+    config: WalkConfig, robot: Robot, job: Job, plant: Plant, *, ticks: int
 ) -> Iterator[tuple[Plan, Sample]]:
     """Yield plans and samples of each block of ticks (numpy), until t = `ticks` or a fall."""
     count, first = substeps(config), first_tick(config)
@@ -231,15 +225,10 @@ def _walk_blocks(
     while step < steps:
         begin, plans, at_start = step, [], []
         for _ in range(_BLOCK if steps - step >= _BLOCK * count else 1):
-            tick, reading, error = first + step // count, readings[step], errors[step]
+            tick, reading = first + step // count, readings[step]
             if tick == start:
                 anchor = _anchor(body, reading, yaw, start)
                 packed_anchor = _pack(anchor)
-            if retune is not None and planner is not None and tick >= start:
-                measurement, _ = _measure(body, reading, yaw, error)
-                wrench = unpack(planner.layout, np.asarray(packed))[1].wrench
-                weights = retune(tick, anchor, measurement, wrench)
-                packed_constants = _pack((body, _parameters(config, weights), *constants[2:]))
             at_start.append((anchor, np.int32(tick), yaw))
             planner = planner_for(controller.contacts_needed(config, tick))
             inputs = packed_anchor, [tick], np.asarray(packed)[:memory_size], [yaw], rows[step, 1:]
