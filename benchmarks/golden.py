@@ -6,15 +6,10 @@
 
 Every option that a flag or a robot's TOML can choose is in it, not the defaults alone. Two commits
 have the names and the tolerances in common; how a commit computes a number is its own business.
-`--table` adds a quick table (data, net, tunings, verdicts), some minutes on two cores.
 """
 
 import argparse
-import json
-import os
-import subprocess
 import sys
-import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -59,7 +54,6 @@ from hector_jax.tuning.variation import no_variation
 
 ROOT = Path(__file__).parents[1]
 STRIDER = ROOT / "examples" / "strider" / "robot.toml"
-TABLE = ROOT / "experiments" / "table.py"
 PAPER_FOOTHOLDS = FootstepConfig(rule="paper")
 DOUBLE_SUPPORT = GaitConfig(stance=24, swing=16)
 
@@ -252,16 +246,6 @@ def exported() -> Arrays:
     return {"call": _flat([out["force"], out["moment"], out["torque"]])}
 
 
-def table() -> Arrays:
-    """A quick table from nothing: data, net, tunings, verdicts."""
-    with tempfile.TemporaryDirectory() as folder:
-        words = ["--quick", "--data", f"{folder}/data", "--out", f"{folder}/table"]
-        here = os.environ | {"PYTHONPATH": str(ROOT)}  # not the package that is installed
-        subprocess.run([sys.executable, TABLE, *words], check=True, env=here)
-        told = json.loads((Path(folder) / "table" / "quick" / "table.json").read_text())
-    return _numbers(told["trajectories"])
-
-
 def _numbers(tree: Any, name: str = "") -> Arrays:
     if isinstance(tree, dict):
         rows = [_numbers(value, f"{name}.{key}") for key, value in tree.items()]
@@ -278,7 +262,6 @@ SECTIONS: dict[str, Section] = {
     "seconds": (seconds, 1e-9),
     "walks": (walks, 1e-6),
     "exported": (exported, 1e-12),
-    "table": (table, 1e-3),
 }
 
 
@@ -296,10 +279,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.golden", description=__doc__)
     parser.add_argument("what", choices=("make", "compare"))
     parser.add_argument("file", type=Path, help="golden results (.npz)")
-    parser.add_argument("--only", nargs="+", choices=SECTIONS, help="sections; all but the table")
-    parser.add_argument("--table", action="store_true", help="the quick table too")
+    parser.add_argument("--only", nargs="+", choices=SECTIONS, help="sections; all by default")
     flags = parser.parse_args()
-    names = flags.only or [name for name in SECTIONS if name != "table" or flags.table]
+    names = flags.only or list(SECTIONS)
     setup_jax()
     found = {}
     for name in names:
