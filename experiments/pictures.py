@@ -28,8 +28,18 @@ from matplotlib.axes import Axes
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from PIL import Image, ImageDraw, ImageFont
 
-from hector_jax import Job, Weights, expert, hfs, load_robot, named_command, nominal
-from hector_jax import setup_jax, walk, walk_config
+from hector_jax import (
+    Job,
+    Weights,
+    expert,
+    hfs,
+    load_robot,
+    named_command,
+    nominal,
+    setup_jax,
+    walk,
+    walk_config,
+)
 from hector_jax.control.weights_file import best
 from hector_jax.core.console import exit_code, say
 from hector_jax.core.trajectory import Trajectory
@@ -42,6 +52,7 @@ from hector_jax.sim.standin import standin
 ROOT = Path(__file__).parents[1]
 OUT = ROOT / "docs" / "pictures"
 RACE = ROOT / "docs" / "race" / "nominal" / "race.json"
+CLOSE_NOTICES = "document.querySelectorAll('.mantine-CloseButton-root').forEach(x => x.click())"
 METHODS = {  # of the race, by plain names, with their lines
     "nominal walks": ("hector tune --walks", {"color": "#00805f", "linewidth": 2.2}),
     "nominal turbo on model": (
@@ -231,6 +242,8 @@ def draw_page(path: Path, run: Path) -> None:
             while "before:" not in tab.text() and time.monotonic() < deadline:
                 time.sleep(2.0)
             time.sleep(6.0)
+            tab.call("Runtime.evaluate", expression=CLOSE_NOTICES)
+            time.sleep(2.0)
             Image.fromarray(tab.picture()).save(path, optimize=True)
     finally:
         server.terminate()

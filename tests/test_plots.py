@@ -14,7 +14,7 @@ from hector_jax.grfm.nets import History
 from hector_jax.report import plots
 from hector_jax.report.fidelity import Drift
 from hector_jax.report.motion import motions
-from hector_jax.report.plots import distances
+from hector_jax.report.plots import distances, style
 from hector_jax.report.plots.style import SETS, label_of, looks_of
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.loss import PAPER_LOSS

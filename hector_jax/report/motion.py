@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from hector_jax.core.trajectory import State, Trajectory, Wrench, from_start
 from hector_jax.robot.model import Robot
 
-COLOURS = ((178, 178, 178), (31, 47, 143))  # before and after: nominal and best of plots
 INK = (20, 20, 25)
 MIN_SOLE = 0.015  # [m] least length of a footprint ahead of and behind the foot point
 

@@ -192,6 +192,7 @@ def _project(
 
 
 def _encode(file: str, frames: Iterable[Image.Image], size: tuple[int, int], rate: int) -> None:
+    options: dict[str, Any]
     if not file.endswith(".mp4"):
         first, *rest = frames
         durations = [1000 // rate] * len(rest) + [_LAST]
@@ -205,7 +206,7 @@ def _encode(file: str, frames: Iterable[Image.Image], size: tuple[int, int], rat
             method=6,
         )
         return
-    options: dict[str, Any] = {"codec": "libx264", "macro_block_size": 2, "quality": None}
+    options = {"codec": "libx264", "macro_block_size": 2, "quality": None}
     options["output_params"] = ["-crf", "19", "-preset", "fast", "-movflags", "+faststart"]
     writer = imageio_ffmpeg.write_frames(file, size, fps=rate, ffmpeg_log_level="error", **options)
     writer.send(None)

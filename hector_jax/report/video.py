@@ -1,10 +1,10 @@
 """Two walks of one command side by side: a film, and a strip of snapshots.
 
-The camera goes beside the reference. Both halves have the same one and, as each walk is shown in the
-frame of its start, the same reference. MuJoCo chooses its OpenGL back end when it is imported, and a broken back end may kill
-its process. So child processes (render.py) try the back ends in turn: EGL, OSMesa, GLFW, or only
-that of MUJOCO_GL if it is set. If none can draw, `VideoUnavailable` gives the reason in one line,
-and the run goes on without a film.
+The camera goes beside the reference. Both halves have the same one and, as each walk is shown in
+the frame of its start, the same reference. MuJoCo chooses its OpenGL back end when it is imported,
+and a broken back end may kill its process. So child processes (render.py) try the back ends in
+turn: EGL, OSMesa, GLFW, or only that of MUJOCO_GL if it is set. If none can draw,
+`VideoUnavailable` gives the reason in one line, and the run goes on without a film.
 """
 
 import os

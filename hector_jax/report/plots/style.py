@@ -102,7 +102,7 @@ def label_of(name: str) -> str:
 
 
 def rgb_of(titles: Iterable[str]) -> list[tuple[int, int, int]]:
-    """Return the colours, 0 to 255, of weight sets by their names or by their titles of `titled`."""
+    """Return the colours, 0 to 255, of weight sets by their names or titles (of `titled`)."""
     known = {label_of(name): name for name in SETS}
     names = [title.partition(": ")[2] or title for title in titles]
     looks = looks_of(known.get(name, name) for name in names)
