@@ -20,6 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
@@ -84,30 +85,39 @@ def walk_of(weights: Weights, trajectory: str = "straight") -> Trajectory:
 # The method
 
 
-def _box(axes: Axes, place: tuple[float, float], size: tuple[float, float], text: str, **look: str):
+def _box(
+    axes: Axes, place: tuple[float, float], size: tuple[float, float], text: str, **look: str
+) -> None:
+    """Draw a box around a place, with a title and lines below it."""
     (x, y), (width, height) = place, size
-    face = {"facecolor": "#eef1f5", "edgecolor": "#33383f", **look}
+    face: dict[str, Any] = {"facecolor": "#eef1f5", "edgecolor": "#33383f", **look}
     shape = "round,pad=0,rounding_size=0.08"
     corner = x - width / 2, y - height / 2
     axes.add_patch(FancyBboxPatch(corner, width, height, boxstyle=shape, linewidth=1.2, **face))
     title, *rest = text.split("\n")
     up = 0.13 * len(rest)
-    centre = {"ha": "center", "va": "center"}
+    centre: dict[str, Any] = {"ha": "center", "va": "center"}
     axes.text(x, y + up, title, weight="bold", fontsize=11, **centre)
     for i, line in enumerate(rest, 1):
         axes.text(x, y + up - 0.27 * i, line, fontsize=9.5, **centre)
 
 
-def _arrow(axes: Axes, *points: tuple[float, float], text: str = "", at=(0.0, 0.0), **look):
+def _arrow(
+    axes: Axes,
+    *points: tuple[float, float],
+    text: str = "",
+    at: tuple[float, float] = (0.0, 0.0),
+    **look: Any,
+) -> None:
     """Draw an arrow along some points, with words at a place."""
-    line = {"color": "#33383f", "linewidth": 1.6, **look}
+    line: dict[str, Any] = {"color": "#33383f", "linewidth": 1.6, **look}
     for start, end in zip(points[:-2], points[1:-1], strict=True):
         axes.plot(*zip(start, end, strict=True), solid_capstyle="round", **line)
     style = "-|>,head_width=3.5,head_length=6"
-    last = {"arrowstyle": style, "shrinkA": 0.0, "shrinkB": 0.0}
+    last: dict[str, Any] = {"arrowstyle": style, "shrinkA": 0.0, "shrinkB": 0.0}
     axes.add_patch(FancyArrowPatch(points[-2], points[-1], **last, **line))
     if text:
-        axes.text(*at, text, fontsize=9.5, ha="center", va="center", color=line["color"])
+        axes.text(at[0], at[1], text, fontsize=9.5, ha="center", va="center", color=line["color"])
 
 
 def draw_method(path: Path) -> None:
@@ -174,7 +184,7 @@ def draw_before_after(path: Path) -> None:
         right.set(ylabel="error in pitch [degrees]")
         right.axhline(0.0, color="black", linewidth=0.8)
         for panel in (left, right):
-            panel.set(xlabel="time [s]", xlim=(0, times[-1]))
+            panel.set(xlabel="time [s]", xlim=(0, 4))
 
 
 def draw_race(path: Path) -> None:
@@ -228,7 +238,7 @@ def _still(robot: Robot, weights: Weights, title: str) -> Image.Image:
 def draw_page(path: Path, run: Path) -> None:
     """Take a picture of the page of `hector view` on a run."""
     sys.path.insert(0, str(ROOT / "tests"))
-    from browser import opened
+    from browser import opened  # pyright: ignore[reportMissingImports]
 
     port = 8765
     words = [sys.executable, "-m", "hector_jax", "view", str(run), "--port", str(port)]
