@@ -57,7 +57,7 @@ CLOSE_NOTICES = "document.querySelectorAll('.mantine-CloseButton-root').forEach(
 METHODS = {  # of the race, by plain names, with their lines
     "nominal walks": ("hector tune --walks", {"color": "#00805f", "linewidth": 2.2}),
     "nominal turbo on model": (
-        "Bayesian optimisation (TuRBO)",
+        "Bayesian optimisation (TuRBO with our model)",
         {"color": "#e07c24", "linestyle": (0, (5, 1.5))},
     ),
     "nominal lq-cma-es": ("CMA-ES (lq)", {"color": "#7a3e9d", "linestyle": (0, (1.2, 1.2))}),
@@ -130,7 +130,7 @@ def draw_method(path: Path) -> None:
         main, y = (2.0, 1.15), 3.0
         _box(axes, (0.85, y), (1.4, 1.15), "command\nvelocity,\nturning rate", facecolor="white")
         _box(axes, (3.35, y), main, "MPC\na quadratic program\nwith weights Q, R")
-        _box(axes, (6.35, y), main, "ground model\nGRFM-Net: from wished\nto real ground force")
+        _box(axes, (6.35, y), main, "ground model\nGRFM-Net: wished to\nreal ground force")
         _box(axes, (9.1, y), (1.7, 1.15), "rigid body\ntrunk with\nmass, inertia")
         _box(axes, (11.35, y), (1.4, 1.15), "loss\nerrors and\njerky forces", facecolor="white")
         _arrow(axes, (1.55, y), (2.35, y))
@@ -198,7 +198,10 @@ def draw_race(path: Path) -> None:
             axes.plot(counts, np.median(losses, axis=1), marker="o", label=label, **line)
             band = losses.min(axis=1), losses.max(axis=1)
             axes.fill_between(counts, *band, color=line["color"], alpha=0.15, linewidth=0)
-        axes.set(xlabel="walks on the simulator", ylabel="loss of the best so far [10$^6$]")
+        axes.set(
+            xlabel="walks on the simulator (median and range of three repeats)",
+            ylabel="loss of the best so far [10$^6$]",
+        )
         axes.set(xlim=(-2, 202), ylim=(0, None))
 
 

@@ -105,8 +105,8 @@ def test_the_falls_under_disturbances_are_those_of_their_file():
 def test_what_a_run_prints_is_what_its_result_says():
     sets = json.loads(RUN.read_text())["sets"]
     each = {name: plain(sets[name]["rms"])[:3] for name in ("best", "nominal", "expert")}
-    first = "best is {:.1f} cm off in the plane, {:.1f} cm in height and {:.1f} degrees in pitch"
-    rest = ["{} {:.1f}, {:.1f} and {:.1f}".format(name, *each[name]) for name in [*each][1:]]
+    first = "best is {:.1f} cm off, {:.1f} cm in height, {:.1f} degrees in pitch"
+    rest = ["{} {:.1f}, {:.1f}, {:.1f}".format(name, *each[name]) for name in [*each][1:]]
     assert "; ".join([first.format(*each["best"]) + " (RMS)", *rest]) + "." in TEXT
     falls = ", ".join(f"{name} {sets[name]['falls']}" for name in each)
     walks = sets["best"]["plants"]

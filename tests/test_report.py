@@ -198,7 +198,7 @@ def test_the_report_opens_with_errors_falls_and_what_to_do_next(tmp_path):
     lines = report.first_lines(verdict, "latest")
     assert len(lines) == 3
     of = report.plain_errors(verdict, "with")
-    assert lines[0].startswith(f"with is {of['plane']:.1f} cm off in the plane, ")
+    assert lines[0].startswith(f"with is {of['plane']:.1f} cm off, ")
     assert f"{of['pitch']:.1f} degrees in pitch (RMS); nominal " in lines[0]
     assert lines[1].endswith("the tuning has not seen: with 0, nominal 0, expert 1.")
     assert all(f"`hector {name} latest`" in lines[2] for name in ("view", "export"))
