@@ -190,7 +190,7 @@ def draw_before_after(path: Path) -> None:
 def draw_race(path: Path) -> None:
     """Draw the loss of the best weights so far by the number of walks on the simulator."""
     race = json.loads(RACE.read_text())["s"]
-    with drawing(path, 5.8, 2.9, dpi=190, legend_columns=3) as figure:
+    with drawing(path, 5.8, 3.1, dpi=190, legend_columns=2) as figure:
         axes = figure.subplots()
         for method, (label, line) in METHODS.items():
             each = {int(walks): np.divide(x, 1e6) for walks, x in race[method]["own"].items()}

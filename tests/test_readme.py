@@ -110,9 +110,7 @@ def test_what_a_run_prints_is_what_its_result_says():
     assert "; ".join([first.format(*each["best"]) + " (RMS)", *rest]) + "." in TEXT
     falls = ", ".join(f"{name} {sets[name]['falls']}" for name in each)
     walks = sets["best"]["plants"]
-    assert (
-        f"Falls in {walks} walks on simulated robots that the tuning has not seen: {falls}." in TEXT
-    )
+    assert f"Falls in {walks} walks on robots that the tuning has not seen: {falls}." in TEXT
 
 
 @pytest.mark.parametrize(
