@@ -14,7 +14,7 @@ QUICK_TESTS := $(addprefix tests/test_,$(addsuffix .py,footstep gait legs refere
 LOCK = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --no-header \
 	--no-emit-index-url pyproject.toml
 
-.PHONY: help setup engines tune table verdict grfm search test quick test-all bench check format docs lock
+.PHONY: help setup engines tune verdict grfm search test quick test-all bench check format docs lock
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -35,24 +35,17 @@ engines: $(STAMP) ## install the other physics engines, Drake and Pinocchio
 tune: $(STAMP) ## tune and evaluate: make tune TRAJ=straight|c|s|all, TRAJ="c s", ROBOT=robot.toml
 	@$(BIN)/hector tune --traj $(TRAJ) $(if $(ROBOT),--robot $(ROBOT))
 
-TABLE := runs/table$(if $(QUICK),/quick)
 MODELS := --light-heavy --plant examples/hector-v2/robot.toml
-SHARED_MEAN := shared_mean=docs/batch/shared/weights/shared_mean.json
 
-table: $(STAMP) ## all sets on 32 plants and their verdict in all engines, into runs/table; QUICK=1 for a trial
-	@$(BIN)/python experiments/table.py $(if $(QUICK),--quick)
-	@$(BIN)/hector verdict --engine all $(if $(QUICK),--seeds 1 --engine-seeds 1,$(MODELS)) --out $(TABLE)/verdict \
-		--weights nominal expert $(SHARED_MEAN) $(foreach set,without with search_200,$(set)=$(TABLE)/weights/$(set))
-
-verdict: $(STAMP) ## sets in all engines and models: make verdict WEIGHTS="nominal expert mine.json"
-	@$(BIN)/hector verdict --engine all $(MODELS) --weights $(or $(WEIGHTS),nominal expert $(SHARED_MEAN))
+verdict: $(STAMP) ## sets in all engines and models: make verdict WEIGHTS="nominal mine.json"
+	@$(BIN)/hector verdict --engine all $(MODELS) --weights $(or $(WEIGHTS),nominal expert best)
 
 grfm: $(STAMP) ## how well the nets predict the ground forces: runs/grfm/report.md
 	@$(BIN)/hector grfm
 
 search: $(STAMP) ## search of 2000 walks for each trajectory; continues if interrupted; for a GPU
 	@$(BIN)/hector search --traj all --budget 2000 --population 40 --record runs/search_2000 \
-		--out docs/results/search_2000
+		--out experiments/reports/search_2000
 
 test: $(STAMP) ## the fast tests
 	@$(BIN)/pytest -q -n 2 --dist loadfile

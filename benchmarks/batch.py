@@ -31,9 +31,9 @@ from hector_jax.core.tree import stack
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect, load_net
 from hector_jax.robot.model import load_robot
-from hector_jax.tuning.batch import PER_CALL, Problem, Scenario, lanes_of, tune_batch
+from hector_jax.tuning.batch import PER_CALL, BatchProblem, BatchScenario, lanes_of, tune_batch
 from hector_jax.tuning.difftune import TuneConfig, Tuning, tune
-from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.rollout import RolloutConfig, Scenario
 from hector_jax.tuning.status import Stop
 
 NAME = "straight"
@@ -119,7 +119,7 @@ def measure(
     anchor = standing_anchor(robot)
     effect = last_command if net is None else as_effect(load_net(net, robot)[0])
     starts = sample_weights(nominal(), 1.5, min(DRAWN, max(singles, many, 1)))
-    scenario = Scenario(command, anchor, np.asarray(0), config.loss, np.asarray(1.0))
+    scenario = BatchScenario(command, anchor, np.asarray(0), config.loss, np.asarray(1.0))
 
     def start(i: int) -> Weights:
         return starts[i % len(starts)]
@@ -128,7 +128,7 @@ def measure(
         count: int, devices: list[jax.Device], lanes: int | None = None, config: TuneConfig = config
     ) -> _Run:
         problems = stack(
-            [Problem(start(i), stack([scenario]), np.asarray(1.0)) for i in range(count)]
+            [BatchProblem(start(i), stack([scenario]), np.asarray(1.0)) for i in range(count)]
         )
         phis, times = stack([effect]), []
         options = {"devices": devices, "lanes": lanes}
@@ -157,7 +157,8 @@ def measure(
         f"{config.rollout.ticks} ticks, {NAME}, starts within x/1.5 of nominal, {net or 'no net'}"
     ]
     if singles:
-        one = lambda i: tune(config, robot, start(i), command, anchor, effect)  # noqa: E731
+        model = Scenario(robot, command, anchor, effect)
+        one = lambda i: tune(config, model, start(i))  # noqa: E731
         alone = _timed(lambda: one(0), lambda: [one(i) for i in range(singles)])
         told = [[i.evaluation.loss for i in t.iterations if i.accepted] for t in alone.found]
         then, now = (np.array([losses[i] for losses in told]) for i in (0, -1))

@@ -34,15 +34,16 @@ def one(ticks: int, batch: int, repeats: int) -> dict[str, float]:
     from hector_jax.grfm.effect import last_command
     from hector_jax.robot.model import load_robot
     from hector_jax.tuning.difftune import TuneConfig, tune_step
-    from hector_jax.tuning.rollout import RolloutConfig
+    from hector_jax.tuning.rollout import RolloutConfig, Scenario
 
     setup_jax()
     robot, command = load_robot(), named_command("straight")
     config = TuneConfig(rollout=RolloutConfig(ticks=ticks))
-    anchor, weights = standing_anchor(robot), nominal()
+    scenario = Scenario(robot, command, standing_anchor(robot), last_command)
+    weights = nominal()
 
     def run(weights):
-        return tune_step(config, robot, weights, command, anchor, last_command)
+        return tune_step(config, scenario, weights)
 
     if batch > 1:
         rng = np.random.default_rng(0)

@@ -6,15 +6,10 @@
 
 Every option that a flag or a robot's TOML can choose is in it, not the defaults alone. Two commits
 have the names and the tolerances in common; how a commit computes a number is its own business.
-`--table` adds a quick table (data, net, tunings, verdicts), some minutes on two cores.
 """
 
 import argparse
-import json
-import os
-import subprocess
 import sys
-import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -38,6 +33,7 @@ from hector_jax.core.console import say
 from hector_jax.core.runtime import setup_jax
 from hector_jax.core.trajectory import State, Trajectory
 from hector_jax.core.tree import stack
+from hector_jax.export.export import controller, export_controller, load_controller
 from hector_jax.grfm import dataset, training
 from hector_jax.grfm.collection import Walks
 from hector_jax.grfm.effect import last_command
@@ -46,7 +42,6 @@ from hector_jax.grfm.network import as_effect, effect_of
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.qp import QpConfig, solve_qp
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs.export import controller, export_controller, load_controller
 from hector_jax.sim.loop import Job
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.standin import standin
@@ -54,11 +49,11 @@ from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs, ideal
 from hector_jax.tuning.difftune import TuneConfig, tune, tune_step
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
-from hector_jax.tuning.rollout import RolloutConfig, no_variation, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
+from hector_jax.tuning.variation import no_variation
 
 ROOT = Path(__file__).parents[1]
 STRIDER = ROOT / "examples" / "strider" / "robot.toml"
-TABLE = ROOT / "experiments" / "table.py"
 PAPER_FOOTHOLDS = FootstepConfig(rule="paper")
 DOUBLE_SUPPORT = GaitConfig(stance=24, swing=16)
 
@@ -167,48 +162,51 @@ def rollouts() -> Arrays:
     config = TuneConfig()
     for model, effect in models.items():
         for command in COMMANDS if model == "plain" else ("s",):
-            known = named_command(command), standing_anchor(robot), effect
-            seen = tune_step(config, robot, nominal(), *known)
+            scenario = Scenario(robot, named_command(command), standing_anchor(robot), effect)
+            seen = tune_step(config, scenario, nominal())
             found[f"{model}, {command}"] = _flat(
                 [seen.loss, [seen.terms[term.name] for term in config.loss], seen.gradient]
             )
     short = TuneConfig(rollout=RolloutConfig(ticks=50))
-    known = robot, nominal(), named_command("s"), standing_anchor(robot), last_command
+    scenario = Scenario(robot, named_command("s"), standing_anchor(robot), last_command)
     for name, walking in controllers().items():
         if name not in ("default", "leg weight"):
             optional = replace(short, rollout=RolloutConfig(walk=walking, ticks=50))
-            seen = tune_step(optional, *known)
+            seen = tune_step(optional, scenario, nominal())
             found[name] = _flat([seen.loss, seen.gradient])
     lead = replace(short, rollout=RolloutConfig(ticks=50, lead=20, block=40))
-    found["lead"] = _flat(tune_step(lead, *known).gradient)
-    walked, columns = jax.jit(sensitivity.propagate, static_argnums=0)(short.rollout, *known)
-    found["forward recursion"] = _flat(sensitivity.gradient(PAPER_LOSS, walked, columns, known[1]))
+    found["lead"] = _flat(tune_step(lead, scenario, nominal()).gradient)
+    walked, columns = jax.jit(sensitivity.propagate, static_argnums=0)(
+        short.rollout, scenario, nominal()
+    )
+    found["forward recursion"] = _flat(sensitivity.gradient(PAPER_LOSS, walked, columns, nominal()))
     noise = State(*(np.full(3, 1e-3) for _ in range(4)))
     varied = no_variation()._replace(
         mass=np.asarray(1.1), friction=np.asarray(0.4), delay=np.asarray(0.004), noise=noise
     )
-    varied = jax.tree.map(jnp.asarray, varied)
+    varied = scenario._replace(variation=jax.tree.map(jnp.asarray, varied))
     found["variation"] = _flat(
-        jax.jit(rollout, static_argnums=0)(short.rollout, *known, varied).state
+        jax.jit(rollout, static_argnums=0)(short.rollout, varied, nominal()).state
     )
     other = load_robot(STRIDER)
     config = TuneConfig(rollout=RolloutConfig(walk=walk_config(other), ticks=50))
-    known = other, nominal(other), named_command("s"), standing_anchor(other), last_command
-    seen = tune_step(config, *known)
+    scenario = Scenario(other, named_command("s"), standing_anchor(other), last_command)
+    seen = tune_step(config, scenario, nominal(other))
     return found | {"strider": _flat([seen.loss, seen.gradient])}
 
 
 def tunings() -> Arrays:
     """Ten iterations with each rule."""
     robot, found = load_robot(), {}
-    known = robot, nominal(), named_command("s"), standing_anchor(robot)
+    effect = effect_of(None, WalkConfig())
+    scenario = Scenario(robot, named_command("s"), standing_anchor(robot), effect)
     rules = {
         "gauss_newton": TuneConfig(),
         "relative": TuneConfig(rule="relative"),
         "literal": TuneConfig(rule="literal", beta_q=1e-5, beta_r=1e-17),
     }
     for name, config in rules.items():
-        ended = tune(config, *known, effect_of(None, WalkConfig()))
+        ended = tune(config, scenario, nominal())
         found[f"{name}, L"] = [float(one.evaluation.loss) for one in ended.iterations]
         found[f"{name}, weights"] = np.asarray(weights_to_vector(ended.weights))
     return found
@@ -248,16 +246,6 @@ def exported() -> Arrays:
     return {"call": _flat([out["force"], out["moment"], out["torque"]])}
 
 
-def table() -> Arrays:
-    """A quick table from nothing: data, net, tunings, verdicts."""
-    with tempfile.TemporaryDirectory() as folder:
-        words = ["--quick", "--data", f"{folder}/data", "--out", f"{folder}/table"]
-        here = os.environ | {"PYTHONPATH": str(ROOT)}  # not the package that is installed
-        subprocess.run([sys.executable, TABLE, *words], check=True, env=here)
-        told = json.loads((Path(folder) / "table" / "quick" / "table.json").read_text())
-    return _numbers(told["trajectories"])
-
-
 def _numbers(tree: Any, name: str = "") -> Arrays:
     if isinstance(tree, dict):
         rows = [_numbers(value, f"{name}.{key}") for key, value in tree.items()]
@@ -274,7 +262,6 @@ SECTIONS: dict[str, Section] = {
     "seconds": (seconds, 1e-9),
     "walks": (walks, 1e-6),
     "exported": (exported, 1e-12),
-    "table": (table, 1e-3),
 }
 
 
@@ -292,10 +279,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.golden", description=__doc__)
     parser.add_argument("what", choices=("make", "compare"))
     parser.add_argument("file", type=Path, help="golden results (.npz)")
-    parser.add_argument("--only", nargs="+", choices=SECTIONS, help="sections; all but the table")
-    parser.add_argument("--table", action="store_true", help="the quick table too")
+    parser.add_argument("--only", nargs="+", choices=SECTIONS, help="sections; all by default")
     flags = parser.parse_args()
-    names = flags.only or [name for name in SECTIONS if name != "table" or flags.table]
+    names = flags.only or list(SECTIONS)
     setup_jax()
     found = {}
     for name in names:

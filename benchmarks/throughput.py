@@ -23,6 +23,7 @@ from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.batch import COMPILER_OPTIONS
 from hector_jax.tuning.difftune import TuneConfig, tune_step
+from hector_jax.tuning.rollout import Scenario
 
 DRAWN = 256  # different problems; larger batches repeat them
 
@@ -51,13 +52,13 @@ def layer_times(batches: list[int], rounds: int) -> dict[str, list[float]]:
 def loop_time(batch: int) -> tuple[float, float]:
     """Seconds of value-and-gradient of `batch` rollouts of 400 ticks; share that fell."""
     config, robot = TuneConfig(), load_robot()
-    command, anchor = named_command("straight"), standing_anchor(robot)
+    scenario = Scenario(robot, named_command("straight"), standing_anchor(robot), last_command)
     rng = np.random.default_rng(0)
     weights = jax.tree.map(
         lambda w: w * np.exp(rng.uniform(-0.3, 0.3, (batch, *w.shape))), nominal()
     )
     run = jax.jit(
-        jax.vmap(lambda weights: tune_step(config, robot, weights, command, anchor, last_command)),
+        jax.vmap(lambda weights: tune_step(config, scenario, weights)),
         compiler_options=COMPILER_OPTIONS,
     )
     result = jax.block_until_ready(run(weights))

@@ -52,7 +52,9 @@ PACKAGES = {  # in this order: title and purpose of each page of the reference
     "grfm": ("Ground reaction net", "phi: the map from command to effect, its data and training."),
     "tuning": ("Tuning", "Rollout, loss and Gauss-Newton steps, for one problem or for many."),
     "search": ("Search", "Tuning by walks on a simulator, without derivatives."),
-    "runs": ("Runs", "Steps from data to evaluation, scores, files of a run, export."),
+    "store": ("Store", "What is computed once and kept: nets, tunings, the folder of a run."),
+    "verdict": ("Verdict", "Walks of weight sets, scores and their statistics."),
+    "export": ("Export", "Weights and controller as files for a robot's computer."),
     "report": ("Report", "Tables, pictures, films and pages of a run."),
 }
 PUBLIC = {  # of packages without `__all__`, in whichever of their modules they are defined
@@ -63,7 +65,9 @@ PUBLIC = {  # of packages without `__all__`, in whichever of their modules they 
     "tuning": """RolloutConfig rollout LossTerm losses with_alphas TuneConfig Evaluation Tuning
         tune descend""",
     "search": "SearchConfig search",
-    "runs": "Score score Verdict make_verdict load_run export",
+    "store": "load_run",
+    "verdict": "Score score Verdict make_verdict",
+    "export": "export",
     "report": "compare_runs write_film",
 }
 _ROLE = re.compile(r"\{(?:func|class|mod|meth)\}`(hector_jax[\w.]*)`")

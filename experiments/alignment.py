@@ -16,7 +16,7 @@ from scipy.stats import spearmanr
 
 from hector_jax.control.weights import Weights, direction_names, directions, weights_to_vector
 from hector_jax.report.report import markdown_table
-from hector_jax.runs.metrics import Interval, bootstrap
+from hector_jax.verdict.metrics import Interval, bootstrap
 
 SAG = ("Q_z", "Q_vz", "R_Fz")
 """The weights that a rigid body that sinks, or a robot that floats, depends on most."""

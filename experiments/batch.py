@@ -38,16 +38,16 @@ from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect, load_net
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import verdicts
-from hector_jax.runs.metrics import Score
-from hector_jax.runs.setup import Setup
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections, hfs, hfs_varied
-from hector_jax.tuning.batch import Problem, Scenario, tail_weights, tune_batch
+from hector_jax.store.setup import Setup
+from hector_jax.tuning.batch import BatchProblem, BatchScenario, tail_weights, tune_batch
 from hector_jax.tuning.difftune import TuneConfig, Tuning, single
 from hector_jax.tuning.loss import PAPER_LOSS, Terms, with_alphas
-from hector_jax.tuning.rollout import Variation, no_variation
 from hector_jax.tuning.status import Stop
+from hector_jax.tuning.variation import Variation, no_variation
+from hector_jax.verdict import judging
+from hector_jax.verdict.metrics import Score
 
 HELD_BACK = Command(  # forward, sideways and turns of another rate; used by no tuning
     np.array([1.0, 1.0, 2.0]),
@@ -126,7 +126,7 @@ def tune(
     flags: Flags,
     robot: Robot,
     effects: Any,
-    problems: Sequence[Problem],
+    problems: Sequence[BatchProblem],
     title: str,
     nominal_rows: slice = slice(None),
 ) -> Tuning:
@@ -159,16 +159,16 @@ def scenario(
     scale: float = 1.0,
     effect: int = 0,
     variation: Variation | None = None,
-) -> Scenario:
+) -> BatchScenario:
     """Return a walk from standing, with the paper's weights of tracking times `tracking`."""
     loss = with_alphas({t.name: tracking * t.weight for t in PAPER_LOSS[:2]})
     anchor, index = standing_anchor(robot), np.asarray(effect)
-    return Scenario(command, anchor, index, loss, np.asarray(scale), variation)
+    return BatchScenario(command, anchor, index, loss, np.asarray(scale), variation)
 
 
-def problem(start: Weights, scenarios: Sequence[Scenario], tail: float = 1.0) -> Problem:
+def problem(start: Weights, scenarios: Sequence[BatchScenario], tail: float = 1.0) -> BatchProblem:
     """Return the problem of tuning a weight set on scenarios."""
-    return Problem(start, stack(scenarios), np.asarray(tail))
+    return BatchProblem(start, stack(scenarios), np.asarray(tail))
 
 
 def first_host() -> bool:
@@ -220,7 +220,7 @@ def scores_on(
     """Return the scores of weight sets, stacked over the plants."""
     seeds = range(first_seed, first_seed + len(plants))
     setup = Setup(pool, TuneConfig(), robot)
-    judgement = verdicts.judge(setup, sets, command, plants, seeds, title=title)
+    judgement = judging.judge(setup, sets, command, plants, seeds, title=title)
     return {name: stack(scores) for name, scores in judgement.scores.items()}
 
 

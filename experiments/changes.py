@@ -143,10 +143,10 @@ class ChangingPlant(MujocoPlant):
 
 
 def walk_with_changes(
-    config: WalkConfig, robot: Robot, job: Job, changes: Sequence[Change], **options: Any
+    config: WalkConfig, robot: Robot, job: Job, changes: Sequence[Change]
 ) -> Trajectory:
-    """Walk once on a plant that changes; `options` are those of `sim.walk.walk`."""
-    return walk(config, robot, job, build=partial(ChangingPlant, changes=changes), **options)
+    """Walk once on a plant that changes."""
+    return walk(config, robot, job, build=partial(ChangingPlant, changes=changes))
 
 
 def walk_all(

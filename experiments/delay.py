@@ -30,12 +30,12 @@ from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, Range, check
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.robot.response import response
-from hector_jax.runs import metrics
 from hector_jax.sim.loop import Job
 from hector_jax.sim.margin import loops, modes, step_response
 from hector_jax.sim.walk import walk_many
 from hector_jax.sim.world import MAX_DELAY, Imperfections, hfs, truth
 from hector_jax.tuning.loss import loss_of_robot
+from hector_jax.verdict import metrics
 
 NOISE = {"position": 0.003, "velocity": 0.03, "angle": 0.005, "ang_velocity": 0.03, "joint": 0.001}
 """White noise of the stand-in's estimate, by field of `Estimator`."""

@@ -18,7 +18,7 @@ from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree import stack
 from hector_jax.robot.model import Robot
-from hector_jax.runs.cache import content_key, load_or_make
+from hector_jax.store.cache import content_key, load_or_make
 
 Tree = TypeVar("Tree")
 Walk = TypeVar("Walk")  # a job, or what else is walked
@@ -101,7 +101,7 @@ def walk_groups(
         settings: on which the walks depend beside the jobs, see `content_key`; noted in the files.
         title: of the progress bar, after the number of walks.
     """
-    code = ("sim.walk", "sim.parallel", "runs.metrics")
+    code = ("sim.walk", "sim.parallel", "verdict.metrics")
     paths = {
         name: folder / f"{name}-{content_key(*settings, robot, tuple(jobs), code=code)}.npz"
         for name, jobs in groups.items()

@@ -42,16 +42,17 @@ from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import metrics, tunings, verdicts
-from hector_jax.runs.cache import content_key, robot_hash
-from hector_jax.runs.campaign import Campaign, box_of, weights_at
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.walks import space_of
 from hector_jax.search.cmaes import Generation, add_row, read_journal, to_generation
 from hector_jax.sim.engine import Engine, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import Imperfections, named_world
+from hector_jax.store import tunings
+from hector_jax.store.cache import content_key, robot_hash
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.loss import loss_of
+from hector_jax.verdict import judging, metrics
+from hector_jax.walk_tuning.campaign import Campaign, box_of, weights_at
+from hector_jax.walk_tuning.walks import campaign_space
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,7 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
         "numbers": list(campaign.numbers),
         "start": weights_tree(campaign.start),
         "plants": [tree_hash(plant) for plant in campaign.plants],
-        "code": [code_hash("runs.walks", *engine.modules), function_id(search)],
+        "code": [code_hash("walk_tuning.walks", *engine.modules), function_id(search)],
         **{name: getattr(flags, name) for name in ("population", "spread", "seed")},
     }
     size, dimensions = flags.population, len(box_of(campaign))
@@ -132,7 +133,10 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
         return generation
 
     path = campaign.folder / "generations.jsonl"
-    rows, space = read_journal(path, head, what="search", parse=parse), space_of(pool, campaign)
+    rows, space = (
+        read_journal(path, head, what="search", parse=parse),
+        campaign_space(pool, campaign),
+    )
     losses = partial(losses_of, pool, campaign, engine, batch=size * len(campaign.cases))
     at_start = next(losses([campaign.start]))
     if not np.isfinite(at_start).all():
@@ -176,7 +180,7 @@ def main() -> None:
             "start": start,
             "search": answer,
         }
-        judge = partial(verdicts.judge, Setup(pool, config, robot), sets, folder=folder / "scores")
+        judge = partial(judging.judge, Setup(pool, config, robot), sets, folder=folder / "scores")
         scores = {
             name: judge(command, plants, seeds, title=f"walking {name}").scores
             for name, command in commands.items()

@@ -52,7 +52,7 @@ from hector_jax.sim.standin import standin
 
 ROOT = Path(__file__).parents[1]
 OUT = ROOT / "docs" / "pictures"
-RACE = ROOT / "docs" / "race" / "nominal" / "race.json"
+RACE = ROOT / "experiments" / "reports" / "race" / "nominal" / "race.json"
 CLOSE_NOTICES = "document.querySelectorAll('.mantine-CloseButton-root').forEach(x => x.click())"
 METHODS = {  # of the race, by plain names, with their lines
     "nominal walks": ("hector tune --walks", {"color": "#00805f", "linewidth": 2.2}),

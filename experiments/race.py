@@ -4,7 +4,7 @@
 on the high-fidelity simulator, one trajectory each. All search in the box of the weights, rivals
 within 3 of the start in log-weights or 4 in the metric of the model.
 
-    python experiments/race.py --traj s --start nominal docs/batch/shared/weights/shared_mean.json
+    python experiments/race.py --traj s --start nominal assets/hector-best.json
 
 Each contest is a tuning of its own with a folder under OUT/contests; a later call continues there,
 with more methods or walks too. At the end the best set of each at some budgets walks on plants that
@@ -33,7 +33,7 @@ from lib import check_names, write_report
 from rivals import LEARN, READ_START, RIVALS, Spent, Task
 from scipy.stats import t as student
 
-from hector_jax.control.reference import Command, named_command, standing_anchor
+from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.arrays import Array
@@ -47,17 +47,19 @@ from hector_jax.core.tree_file import load_tree, save_tree
 from hector_jax.grfm.network import effect_of
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import tunings, verdicts, walks
-from hector_jax.runs.cache import content_key
-from hector_jax.runs.campaign import Campaign, box_of, weights_at
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.walks import Row
 from hector_jax.search import few_walks
 from hector_jax.search.few_walks import Proposal, Space
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.world import hfs, named_world
+from hector_jax.store import tunings
+from hector_jax.store.cache import content_key
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.loss import Loss, loss_of
-from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
+from hector_jax.verdict import judging
+from hector_jax.walk_tuning import walks
+from hector_jax.walk_tuning.campaign import Campaign, box_of, weights_at
+from hector_jax.walk_tuning.walks import Row
 
 BUDGETS = (0, 1, 5, 10, 25, 50, 100, 200)
 WALKS = "walks"
@@ -156,17 +158,19 @@ def search_job(campaign: Campaign, seed: int) -> tuple[np.ndarray, np.ndarray]:
     identity = np.eye(len(box))
     space = Space(identity, identity, np.zeros(len(box)), box_of(campaign))
     config = campaign.config.rollout
-    inputs = config, campaign.robot, command, effect_of(None, config.walk), campaign.config.loss
-    at_start = float(np.log(_model_loss(*inputs, campaign.start)))
+    anchor, effect = standing_anchor(campaign.robot), effect_of(None, config.walk)
+    scenario, loss = Scenario(campaign.robot, command, anchor, effect), campaign.config.loss
+    at_start = float(np.log(_model_loss(config, scenario, loss, campaign.start)))
     points: list[np.ndarray] = []
     losses: list[float] = []
 
     def walk(point: Float[np.ndarray, " n"]) -> float:
         if len(losses) == SOURCES:
             raise Spent
-        loss = float(np.log(_model_loss(*inputs, weights_at(campaign, space, point)))) - at_start
+        found = _model_loss(config, scenario, loss, weights_at(campaign, space, point))
+        change = float(np.log(found)) - at_start
         points.append(point)
-        losses.append(loss if np.isfinite(loss) else max(losses, default=0.0) + 1.0)
+        losses.append(change if np.isfinite(change) else max(losses, default=0.0) + 1.0)
         return losses[-1]
 
     nothing = np.zeros((0, len(box))), np.zeros(0)
@@ -176,15 +180,8 @@ def search_job(campaign: Campaign, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @partial(jax.jit, static_argnums=0)
-def _model_loss(
-    config: RolloutConfig,
-    robot: Robot,
-    command: Command,
-    effect: jax.tree_util.Partial,
-    loss: Loss,
-    weights: Weights,
-) -> Array:
-    return loss_of(loss, rollout(config, robot, weights, command, standing_anchor(robot), effect))
+def _model_loss(config: RolloutConfig, scenario: Scenario, loss: Loss, weights: Weights) -> Array:
+    return loss_of(loss, rollout(config, scenario, weights))
 
 
 def _box(campaign: Campaign) -> Float[np.ndarray, "n 2"]:
@@ -318,7 +315,7 @@ def read_model(pool: Executor, campaign: Campaign, *, searches: bool) -> Model:
     It is computed once, in a folder of its own for all that it depends on.
     """
     settings = campaign.config, campaign.robot, campaign.start, tuple(campaign.commands.values())
-    key = content_key(*settings, SEARCHES, function_id(search_job), code=("runs.walks",))
+    key = content_key(*settings, SEARCHES, function_id(search_job), code=("walk_tuning.walks",))
     campaign = replace(campaign, folder=campaign.folder / key)
     path, size = campaign.folder / "searches.npz", len(box_of(campaign))
     parts = {"steps": np.zeros((0, size)), "losses": np.zeros(0)}
@@ -329,7 +326,7 @@ def read_model(pool: Executor, campaign: Campaign, *, searches: bool) -> Model:
         save_tree(path, parts, kind="searches", robot=campaign.robot)
     if searches:
         parts = load_tree(path, parts, kind="searches", robot=campaign.robot)[0]
-    return Model(walks.space_of(pool, campaign), **parts)
+    return Model(walks.campaign_space(pool, campaign), **parts)
 
 
 def main() -> None:
@@ -407,7 +404,7 @@ def judge(setup: Setup, flags: Flags, bests: Bests) -> dict[tuple[Contest, int],
         sets = {_set_name(key[0], best): best.weights for key, best in of_traj.items()}
         inputs = setup, sets, named_command(traj), plants, seeds
         options = {"title": f"judging {traj}", "folder": flags.out / "scores"}
-        scores = verdicts.judge(*inputs, **options, engine=choose_engine(flags.engine)).scores
+        scores = judging.judge(*inputs, **options, engine=choose_engine(flags.engine)).scores
         for key, best in of_traj.items():
             each = scores[_set_name(key[0], best)]
             fell = any(score.fallen for score in each)

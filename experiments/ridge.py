@@ -27,8 +27,9 @@ from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, check
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import choice, nets, tunings, verdicts
-from hector_jax.runs.setup import Setup
+from hector_jax.store import nets, tunings
+from hector_jax.store.setup import Setup
+from hector_jax.verdict import choice, judging
 
 FIRST_SEED = 7100
 PROBLEMS = {**{name: (name,) for name in COMMANDS}, "all": COMMANDS}
@@ -65,7 +66,9 @@ def walk_robot(flags: Flags, pool: Executor, name: str, file: Path | None) -> Lo
     for ridge in flags.ridges:
         setup = Setup(pool, tunings.tune_config(robot, ridge=ridge), robot)
         folder = flags.out / "kept" / name
-        tuned = tunings.tune(setup, problems, folder, title=f"{name}: tuning with ridge {ridge:g}")
+        tuned = tunings.tune_all(
+            setup, problems, folder, title=f"{name}: tuning with ridge {ridge:g}"
+        )
         sets |= {(key, ridge): found.tuning.weights for key, found in tuned.items()}
     setup = Setup(pool, tunings.tune_config(robot), robot)
     plants = choice.drawn_plants(robot, flags.plants, FIRST_SEED)
@@ -78,7 +81,7 @@ def walk_robot(flags: Flags, pool: Executor, name: str, file: Path | None) -> Lo
         }
         inputs = setup, compared, named_command(command), plants, seeds
         options = {"title": f"{name}: walking {command}", "folder": flags.out / "scores" / name}
-        scores = verdicts.judge(*inputs, **options).scores
+        scores = judging.judge(*inputs, **options).scores
         losses[command] = {key: [float(s.L) for s in rows] for key, rows in scores.items()}
     return losses
 

@@ -53,11 +53,11 @@ from hector_jax.core.tree_file import tree_hash
 from hector_jax.report.report import WORLDS
 from hector_jax.robot.description import HECTOR, Description
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import metrics
-from hector_jax.runs.metrics import Score
 from hector_jax.sim.standin import FAMILIES
 from hector_jax.sim.world import Imperfections, named_world
 from hector_jax.tuning.loss import loss_of_robot
+from hector_jax.verdict import metrics
+from hector_jax.verdict.metrics import Score
 
 BASELINE = "nominal"
 

@@ -24,9 +24,9 @@ from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, check
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.description import HECTOR, PlantSizes
-from hector_jax.runs.metrics import Interval, Score, bootstrap, falls_comparable
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import NO_PUSH, Imperfections, Push, noisy
+from hector_jax.verdict.metrics import Interval, Score, bootstrap, falls_comparable
 
 DIRECTIONS = 45 * np.arange(8)  # [deg] of the pushes, from ahead to the left
 PUSH_START, PUSH_TIME, PUSH_WALK = 0.8, 0.1, 2.5  # [s] the walk includes the recovery

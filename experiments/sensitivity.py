@@ -14,24 +14,22 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float, Int
 
 from hector_jax.control.parameters import step_names, stepped
-from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench
-from hector_jax.robot.model import Robot
 from hector_jax.tuning.curvature import matrix_of_walk
 from hector_jax.tuning.loss import Loss, losses, total
 from hector_jax.tuning.rollout import (
     Carry,
     RolloutConfig,
-    Variation,
-    from_start,
+    Scenario,
     init_carry,
     step_carry,
-    variation_of,
     varied,
     walked_ticks,
     with_constants,
+    with_variation,
+    without_lead,
 )
 
 
@@ -50,19 +48,16 @@ def no_tangents(carry: Carry, weights: Weights) -> Carry:
 
 def step_sensitivities(
     config: RolloutConfig,
-    robot: Robot,
+    scenario: Scenario,
     weights: Weights,
-    command: Command,
-    effect: jax.tree_util.Partial,
     carry: Carry,
     tangents: Carry,
     tick: Int[Array, ""],
-    variation: Variation | None = None,
 ) -> tuple[Carry, Carry, Trajectory, Sensitivities]:
     """Walk one tick of the closed loop with its n tangents.
 
     Args:
-        config, robot, weights, command, effect, carry, tick, variation: see `step_carry`.
+        config, scenario, weights, carry, tick: see `step_carry`.
         tangents: of the `varied` carry; the weights are the first axis.
 
     Returns:
@@ -74,8 +69,7 @@ def step_sensitivities(
 
     def step(parts: Carry, theta: Float[jax.Array, " n"]) -> tuple:
         before = with_constants(parts, carry)
-        inputs = to_weights(theta), command, effect, before, tick, variation
-        after, sample = step_carry(config, robot, *inputs)
+        after, sample = step_carry(config, scenario, to_weights(theta), before, tick)
         return (varied(after), sample.state, sample.command), (after, sample)
 
     def tangent_of(tangent: Carry, direction: Float[Array, " n"]) -> tuple:
@@ -89,27 +83,21 @@ def step_sensitivities(
 
 
 def propagate(
-    config: RolloutConfig,
-    robot: Robot,
-    weights: Weights,
-    command: Command,
-    anchor: Anchor,
-    effect: jax.tree_util.Partial,
-    variation: Variation | None = None,
+    config: RolloutConfig, scenario: Scenario, weights: Weights
 ) -> tuple[Trajectory, Sensitivities]:
     """Compute a rollout and its sensitivities by forward recursion. Source: Eq. 10."""
-    variation = variation_of(config) if variation is None else variation
+    scenario = with_variation(config, scenario)
 
     def tick(carried: tuple[Carry, Carry], j: Int[Array, ""]):
         carry, tangents, sample, columns = step_sensitivities(
-            config, robot, weights, command, effect, *carried, j, variation
+            config, scenario, weights, *carried, j
         )
         return (carry, tangents), (sample, columns)
 
-    carry, ticks = init_carry(robot, anchor, variation), walked_ticks(config, anchor)
+    carry, ticks = init_carry(scenario), walked_ticks(config, scenario.anchor)
     _, (samples, columns) = jax.lax.scan(tick, (carry, no_tangents(carry, weights)), ticks)
     columns = jax.tree.map(lambda s: jnp.swapaxes(s[config.lead :], 0, 1), columns)
-    return from_start(config, samples), columns
+    return without_lead(config, samples), columns
 
 
 def gradient(

@@ -54,15 +54,15 @@ from hector_jax.grfm.collection import fingerprint
 from hector_jax.grfm.effect import Effect, Window, last_command
 from hector_jax.grfm.network import Params, as_effect
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import nets, tunings
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.tunings import Problem
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
+from hector_jax.store import nets, tunings
+from hector_jax.store.setup import Setup
+from hector_jax.store.tunings import Problem
 from hector_jax.tuning.difftune import TuneConfig, step_status, tune_step
 from hector_jax.tuning.loss import PAPER_LOSS, loss_of
-from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.tuning.status import StepStatus
 
 PUBLISHED = {"nominal": nominal, "expert": expert}
@@ -170,7 +170,7 @@ def tuned_sets(
         if name not in loaded
     }
     setup = Setup(pool, config, robot, environment().get("commit", ""))
-    results = tunings.tune(setup, problems, flags.out, title="tuning")
+    results = tunings.tune_all(setup, problems, flags.out, title="tuning")
     return {**loaded, **{name: tuned.tuning.weights for name, tuned in results.items()}}
 
 
@@ -219,9 +219,8 @@ def gradient_jobs(point: Point, phases: Sequence[int]) -> list[Job]:
 
 
 @partial(jax.jit, static_argnums=0)
-def _model_loss(config, robot, weights, command, anchor, effect):
-    walk = rollout(config.rollout, robot, weights, command, anchor, effect)
-    return loss_of(config.loss, walk)
+def _model_loss(config: TuneConfig, scenario: Scenario, weights: Weights) -> jax.Array:
+    return loss_of(config.loss, rollout(config.rollout, scenario, weights))
 
 
 def _model_job(
@@ -234,13 +233,17 @@ def _model_job(
     """Compute gradients at points, NaN if rejected, and losses at others; in a worker."""
     rows = []
     for weights, command, tick in points:
-        anchor = standing_anchor(robot, tick)
-        evaluation = jax.device_get(tune_step(config, robot, weights, command, anchor, effect))
+        scenario = Scenario(robot, command, standing_anchor(robot, tick), effect)
+        evaluation = jax.device_get(tune_step(config, scenario, weights))
         row = alignment.as_directions(weights, evaluation.gradient)
         accepted = step_status(config, evaluation) == StepStatus.ACCEPTED
         rows.append(np.where(accepted, row, np.nan))
     losses = [
-        float(_model_loss(config, robot, weights, command, standing_anchor(robot, tick), effect))
+        float(
+            _model_loss(
+                config, Scenario(robot, command, standing_anchor(robot, tick), effect), weights
+            )
+        )
         for weights, command, tick in others
     ]
     return np.array(rows), np.array(losses)

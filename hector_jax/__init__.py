@@ -28,7 +28,7 @@ _MODULES = {
     "grfm.effect": ("last_command",),
     "grfm.network": ("as_effect", "load_net"),
     "tuning.loss": ("PAPER_LOSS", "LossTerm"),
-    "tuning.rollout": ("RolloutConfig", "rollout"),
+    "tuning.rollout": ("RolloutConfig", "Scenario", "rollout"),
     "tuning.difftune": ("TuneConfig", "tune"),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}

@@ -36,12 +36,13 @@ from hector_jax.grfm.collection import collect
 from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import nets, tunings, verdicts
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.tunings import Problem
 from hector_jax.sim.world import hfs
+from hector_jax.store import nets, tunings
+from hector_jax.store.setup import Setup
+from hector_jax.store.tunings import Problem
 from hector_jax.tuning.difftune import TuneConfig, descend
 from hector_jax.tuning.evaluate import Evaluation, Objective
+from hector_jax.verdict import judging
 
 ROBOT, S = load_robot(), named_command("s")
 WALKS = 160  # so many that 25 kills come before the last one is saved
@@ -79,7 +80,7 @@ def tune_toys(folder: Path, setup, start, problems, title, on_iteration):
 
 def tuning(folder: Path) -> None:
     tunings._tunings = partial(tune_toys, folder)
-    tunings.tune(
+    tunings.tune_all(
         Setup(ThreadPoolExecutor(1), TuneConfig(iterations=60), ROBOT),
         {"toy": Problem((S,), None)},
         folder,
@@ -107,7 +108,7 @@ def training(folder: Path) -> None:
         collect(walks, jobs, partial(walk_jobs, walks), robot=ROBOT)
     config = TrainConfig(os.environ.get("VARIANT", "paper"), epochs=60, batch=16)
     if not (folder / "net.npz").exists():
-        nets.train(config, ROBOT, walks, folder / "net.npz")
+        nets.train_net(config, ROBOT, walks, folder / "net.npz")
 
 
 def table(folder: Path) -> None:
@@ -116,15 +117,15 @@ def table(folder: Path) -> None:
             done(folder, f"{job.seed} {float(job.weights.Q.euler[0])}")
             yield pretend_walk(job.seed, float(job.weights.Q.euler[0]) / 1e4, 1.0)
 
-    verdicts.walk_jobs, tunings._tunings = walks_of, partial(tune_toys, folder)
+    judging.walk_jobs, tunings._tunings = walks_of, partial(tune_toys, folder)
     setup = Setup(ThreadPoolExecutor(1), TuneConfig(iterations=20), ROBOT)
     problems = {"without": Problem((S,), None)}
     with locked(folder):
-        tuned = tunings.tune(setup, problems, folder / "s", title="")["without"]
+        tuned = tunings.tune_all(setup, problems, folder / "s", title="")["without"]
         sets = {"nominal": nominal(), "expert": expert(), "without": tuned.tuning.weights}
         seeds = range(WALKS // 2)
         plants = [hfs()] * len(seeds)
-        verdicts.judge(setup, sets, S, plants, seeds, title="", folder=folder / "s")
+        judging.judge(setup, sets, S, plants, seeds, title="", folder=folder / "s")
 
 
 JOBS = {job.__name__: job for job in (tuning, collection, training, table)}

@@ -7,11 +7,11 @@ from scipy.spatial.transform import Rotation
 from hector_jax.control.weights import nominal
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.core.tree import stack
-from hector_jax.runs.metrics import Score, make_verdict
 from hector_jax.tuning.difftune import Iteration, Tuning
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import PAPER_LOSS, total
 from hector_jax.tuning.status import StepStatus, Stop
+from hector_jax.verdict.metrics import Score, make_verdict
 
 SETS = ("nominal", "expert", "without", "with")
 

@@ -10,24 +10,12 @@ import pytest
 import table_steps
 
 import hector_jax
-from hector_jax.runs import nets
+from hector_jax.store import nets
 
 ROOT = Path(__file__).parents[1] / "hector_jax"
-FLOORS = [
-    ["core"],
-    ["robot"],
-    ["qp"],
-    ["control"],
-    ["sim"],
-    ["grfm"],
-    ["tuning"],
-    ["search"],
-    ["runs"],
-    ["report"],
-    ["cli"],
-    ["__main__"],
-]
-FLOOR = {room: height for height, rooms in enumerate(FLOORS) for room in rooms}
+METHOD = "core robot qp control sim grfm tuning search".split()
+APPLICATION = "importing store verdict walk_tuning export report cli __main__".split()
+FLOOR = {room: height for height, room in enumerate([*METHOD, *APPLICATION])}
 DOORS = {
     "mujoco": ("core.headless", "sim.mjx_model"),
     "pydrake": ("sim.drake",),
@@ -98,10 +86,20 @@ def test_each_outside_package_has_its_door(package):
 
 
 def test_robots_of_others_come_in_by_one_door():
-    importer = "hector_jax.robot.importer"
-    inside = {name for name, target in IMPORTS if target.startswith(importer)}
-    outside = {name for name in inside if not name.startswith("robot.importer")}
-    assert outside == {"robot.model", "cli.commands"}
+    inside = {name for name, target in IMPORTS if target.startswith("hector_jax.importing")}
+    assert {name for name in inside if not name.startswith("importing")} == {"cli.commands"}
+
+
+def test_the_method_takes_no_settings_of_a_command_and_draws_nothing():
+    application = {f"hector_jax.{room}" for room in APPLICATION}
+    outside = {"tyro", "jinja2", "matplotlib", "viser"}
+    wrong = [
+        (name, target)
+        for name, target in IMPORTS
+        if room(name) in METHOD
+        and (target.split(".")[0] in outside or ".".join(target.split(".")[:2]) in application)
+    ]
+    assert not wrong
 
 
 def test_nothing_that_learns_or_searches_can_reach_the_stand_in():
@@ -118,8 +116,9 @@ def test_of_the_scripts_only_those_with_verdicts_reach_the_stand_in():
         for path in scripts
         if any(name.startswith("hector_jax.sim.standin") for name in imported(path))
     }
-    names = ("robustness", "online", "batch", "table", "pictures")  # the last one draws its walks
-    experiments = {f"experiments.{name}" for name in names}
+    experiments = {
+        f"experiments.{name}" for name in ("robustness", "online", "batch", "table", "pictures")
+    }
     assert knowing == experiments | {"benchmarks.golden"}
 
 
@@ -159,7 +158,7 @@ def test_every_public_name_is_there_and_importing_the_package_imports_nothing_el
 
 WRITERS = ("write_text", "write_bytes", "savefig", "save", "savez", "move")
 # into memory, into a folder that is removed, or nowhere
-NOT_LEFT = {"runs.export: savez", "report.plots.style: savefig", "core.tree_file: open"}
+NOT_LEFT = {"export.export: savez", "report.plots.style: savefig", "core.tree_file: open"}
 NOT_LEFT |= {"report.video: write_bytes", "report.render: save", "report.view: open"}
 
 

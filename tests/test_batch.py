@@ -28,8 +28,8 @@ from hector_jax.robot.model import load_robot
 from hector_jax.tuning import batch, difftune
 from hector_jax.tuning.batch import (
     PER_CALL,
-    Problem,
-    Scenario,
+    BatchProblem,
+    BatchScenario,
     choose_rollout,
     lanes_of,
     tail_weights,
@@ -39,8 +39,9 @@ from hector_jax.tuning.difftune import TuneConfig, tune
 from hector_jax.tuning.evaluate import Evaluation, Objective
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
 from hector_jax.tuning.parallel_rollout import parallel_rollout
-from hector_jax.tuning.rollout import RolloutConfig, no_variation, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.tuning.status import StepStatus, Stop
+from hector_jax.tuning.variation import no_variation
 
 ROBOT = load_robot()
 ANCHOR = standing_anchor(ROBOT)
@@ -54,9 +55,9 @@ def vector(weights):
     return np.asarray(weights_to_vector(weights))
 
 
-def toy(config, robot, weights, command, anchor, effect, loss, variation=None, walk=None):
+def toy(config, scenario, weights, loss, *, walk=None):
     """A bowl in log-weights about a point that the command moves; with a floor under it."""
-    middle = np.log(NOMINAL) + 0.3 * jnp.asarray(command.yaw_rate)[0]
+    middle = np.log(NOMINAL) + 0.3 * jnp.asarray(scenario.command.yaw_rate)[0]
     away = jnp.log(weights_to_vector(weights)) - middle
     scale = loss[0].weight
     gradient = vector_to_weights(2.0 * scale * away / weights_to_vector(weights))
@@ -67,9 +68,7 @@ def toy(config, robot, weights, command, anchor, effect, loss, variation=None, w
     )
 
 
-def toy_matrix(
-    config, robot, weights, command, anchor, effect, loss, variation=None, walk=None, others=()
-):
+def toy_matrix(config, scenario, weights, loss, *, walk=None, others=()):
     """Thrice the curvature of the bowl in the log-steps: steps are short and so are many."""
     shared = jnp.asarray(np.pad(directions(), ((0, len(others)), (0, 0))))
     along = jnp.diag(jnp.r_[jnp.zeros(18), jnp.full(len(others), 8.0)])
@@ -91,11 +90,16 @@ def on_toy(monkeypatch):
 
 def scenario(name="straight", loss=PAPER_LOSS, scale=1.0, effect=0, variation=None):
     scale, effect = np.asarray(scale), np.asarray(effect)
-    return Scenario(named_command(name), ANCHOR, effect, loss, scale, variation)
+    return BatchScenario(named_command(name), ANCHOR, effect, loss, scale, variation)
+
+
+def alone_on(name):
+    """The same for a single tuning."""
+    return Scenario(ROBOT, named_command(name), ANCHOR, last_command)
 
 
 def problem(start, scenarios, tail=1.0):
-    return Problem(start, stack(scenarios), np.asarray(tail))
+    return BatchProblem(start, stack(scenarios), np.asarray(tail))
 
 
 def close(one, other, **tolerances):
@@ -109,7 +113,7 @@ def test_each_tuning_of_a_batch_is_that_of_a_single_one(on_toy, config):
     found = tune_batch(config, ROBOT, stack(asked), last_command)
     counts = []
     for i, (start, name) in enumerate(zip(STARTS, names, strict=True)):
-        alone = tune(config, ROBOT, start, named_command(name), ANCHOR, last_command)
+        alone = tune(config, alone_on(name), start)
         counts.append(len(alone.iterations))
         ours = jax.tree.map(lambda x, i=i: x[i], found)
         history = jax.tree.map(lambda x, n=counts[-1]: x[:n], ours.history)
@@ -122,9 +126,9 @@ def test_each_tuning_of_a_batch_is_that_of_a_single_one(on_toy, config):
 
 
 def test_a_batch_tunes_other_numbers_as_a_single_tuning_does(monkeypatch):
-    def leaning(*model, **options):
+    def leaning(config, scenario, weights, loss, *, walk=None):
         """The bowl, and another in the lead of turns, about 1.2."""
-        found, lead = toy(*model, **options), model[2].others["turn_lead"]
+        found, lead = toy(config, scenario, weights, loss), weights.others["turn_lead"]
         gradient = found.gradient._replace(others={"turn_lead": 2e6 * (lead - 1.2)})
         return found._replace(loss=found.loss + 1e6 * (lead - 1.2) ** 2, gradient=gradient)
 
@@ -133,7 +137,7 @@ def test_a_batch_tunes_other_numbers_as_a_single_tuning_does(monkeypatch):
     asked = stack([problem(start, [scenario("c")]) for start in STARTS[:2]])
     found = tune_batch(config, ROBOT, asked, last_command)
     for i, start in enumerate(STARTS[:2]):
-        alone = tune(config, ROBOT, start, named_command("c"), ANCHOR, last_command)
+        alone = tune(config, alone_on("c"), start)
         assert abs(alone.weights.others["turn_lead"] - 1.2) < 0.2
         close(jax.tree.map(lambda x, i=i: x[i], found.weights), alone.weights, rtol=1e-9)
 
@@ -148,8 +152,8 @@ def test_how_many_walk_side_by_side_does_not_matter(on_toy):
 def test_as_many_walk_side_by_side_as_are_asked_for(on_toy, monkeypatch):
     asked, seen = stack([problem(w, [scenario("c")]) for w in STARTS]), []
 
-    def advance(config, lanes, *rest):
-        seen.append(lanes)
+    def advance(program, *rest):
+        seen.append(program.lanes)
         raise InterruptedError
 
     monkeypatch.setattr(batch, "_advance", advance)
@@ -200,10 +204,7 @@ def test_the_mean_of_scenarios_is_tuned_by_the_mean_of_their_matrices(on_toy):
     names, scales, config = ("straight", "c"), np.array([0.5, 4.0]), replace(TOY, iterations=39)
     several = [scenario(name, scale=k) for name, k in zip(names, scales, strict=True)]
     found = tune_batch(config, ROBOT, stack([problem(STARTS[2], several)]), last_command)
-    each = [
-        difftune.model_objective(config, ROBOT, named_command(name), ANCHOR, last_command)
-        for name in names
-    ]
+    each = [difftune.model_objective(config, alone_on(name)) for name in names]
 
     def divided(objective, k):
         def evaluate(weights):
@@ -258,10 +259,10 @@ def test_a_device_counts_the_rollouts_of_whole_problems(monkeypatch):
 @pytest.mark.parametrize(
     ("wrong", "told"),
     [
-        ({"tail": np.array([1.5])}, r"Problem.tail must be from 0 to 1, got 1.5"),
+        ({"tail": np.array([1.5])}, r"BatchProblem.tail must be from 0 to 1, got 1.5"),
         ({"tail": np.zeros(0)}, "stacked, one per problem"),
-        ({"effect": 3}, r"Scenario.effect must be below 1, got 3..3"),
-        ({"scale": 0.0}, "Scenario.scale must be positive"),
+        ({"effect": 3}, r"BatchScenario.effect must be below 1, got 3..3"),
+        ({"scale": 0.0}, "BatchScenario.scale must be positive"),
         (
             {"variation": no_variation()._replace(delay=np.asarray(0.02))},
             "Variation.delay must be from 0 to a tick of 0.01 s, got 0.02",
@@ -379,7 +380,7 @@ def test_on_the_rigid_body_a_batch_is_its_single_tunings():
     asked = stack([problem(nominal(), [scenario(name)]) for name in names])
     found = tune_batch(config, ROBOT, asked, last_command)
     for i, name in enumerate(names):
-        alone = tune(config, ROBOT, nominal(), named_command(name), ANCHOR, last_command)
+        alone = tune(config, alone_on(name), nominal())
         ours = jax.tree.map(lambda x, i=i: x[i], found)
         np.testing.assert_allclose(vector(ours.weights), vector(alone.weights), rtol=1e-9)
         np.testing.assert_allclose(ours.precision, alone.precision, rtol=1e-6, atol=1e-9)

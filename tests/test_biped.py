@@ -24,21 +24,21 @@ from hector_jax.core.files import write_json
 from hector_jax.core.geometry import rot_x, rot_y, rot_z
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, has_fallen
+from hector_jax.export.export import find_weights
 from hector_jax.grfm.collection import load_walks
 from hector_jax.robot import kinematics
 from hector_jax.robot.description import Description, TuningSettings, read_description
 from hector_jax.robot.kinematics import foot_jacobians, foot_poses
 from hector_jax.robot.model import compile_model, describe, load_robot
-from hector_jax.runs import folder as runs
-from hector_jax.runs import nets
-from hector_jax.runs.cache import robot_hash
-from hector_jax.runs.export import find_weights
-from hector_jax.runs.nets import CollectConfig
-from hector_jax.runs.tunings import tune_config
 from hector_jax.sim.loop import Job
 from hector_jax.sim.mjx_model import batched_model, find_places
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import build_world, hfs, ideal
+from hector_jax.store import folder as runs
+from hector_jax.store import nets
+from hector_jax.store.cache import robot_hash
+from hector_jax.store.nets import CollectConfig
+from hector_jax.store.tunings import tune_config
 from hector_jax.tuning.difftune import TuneConfig
 
 STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
@@ -51,7 +51,7 @@ foot_jacobians_jit = jax.jit(foot_jacobians)
 def inverse_legs_jit(robot, position, yaw, up, steps=16):
     """From the standing pose, which takes more steps than from a moment before."""
     start = jnp.asarray(robot.standing_joints)
-    return kinematics.inverse_legs(robot, position, yaw, up, start, steps)
+    return kinematics.inverse_legs(robot, position, yaw, up, start, steps=steps)
 
 
 inverse_forward = jax.jit(jax.jacfwd(inverse_legs_jit, argnums=1))

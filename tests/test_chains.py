@@ -181,7 +181,7 @@ def test_rates_along_a_path_are_the_derivative_of_the_joints(made):
     up = jnp.tile(jnp.array([0.0, 0.0, 1.0]), (legs, 1))
     moved = jnp.tile(jnp.array([[0.3, 0.1, 0.2], [-0.2, 0.1, 0.3]]), (legs // 2, 1))
     yaw = jnp.zeros(legs)
-    at = jax.jit(lambda t: inverse_legs(robot, position + t * moved, yaw, up, start, 12))
+    at = jax.jit(lambda t: inverse_legs(robot, position + t * moved, yaw, up, start, steps=12))
     here, rates = jax.jvp(at, (jnp.asarray(0.05),), (jnp.asarray(1.0),))
     difference = (at(jnp.asarray(0.05 + 1e-5)) - at(jnp.asarray(0.05 - 1e-5))) / 2e-5
     if robot.description.leg_joints <= 6:  # of a seventh joint the part that moves no foot is left

@@ -11,12 +11,12 @@ from pretend import tuning_of
 
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import nominal
-from hector_jax.runs import choice, verdicts
-from hector_jax.runs.metrics import score_like
-from hector_jax.runs.setup import Setup
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import Iteration
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.status import StepStatus
+from hector_jax.verdict import choice, judging
+from hector_jax.verdict.metrics import score_like
 
 SETUP = Setup(Executor(), CONFIG, ROBOT)
 
@@ -58,7 +58,7 @@ def _walk(monkeypatch, median):
             }
         )
 
-    monkeypatch.setattr(verdicts, "judge", judge)
+    monkeypatch.setattr(judging, "judge", judge)
 
 
 STRAIGHT = named_command("straight")
@@ -75,7 +75,7 @@ def test_the_set_that_walks_best_on_drawn_plants_is_taken(monkeypatch, capsys, w
 
 
 def test_without_plants_the_last_one_is_taken(monkeypatch):
-    monkeypatch.setattr(verdicts, "judge", None)
+    monkeypatch.setattr(judging, "judge", None)
     sets = dict.fromkeys(("iteration 0", "iteration 5"), nominal())
     assert choice.walks_best(SETUP, sets, (STRAIGHT,), 0) == "iteration 5"
     assert choice.walks_best(SETUP, {"iteration 0": nominal()}, (STRAIGHT,), 4) == "iteration 0"

@@ -35,10 +35,12 @@ from hector_jax.grfm.effect import last_command
 from hector_jax.report import fidelity
 from hector_jax.robot.description import MODEL_PATH
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import nets, searches, tunings, verdicts
-from hector_jax.runs.nets import CollectConfig
+from hector_jax.store import nets, tunings
+from hector_jax.store.nets import CollectConfig
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.verdict import judging
+from hector_jax.walk_tuning import searches
 
 
 def call(monkeypatch, *arguments):
@@ -353,7 +355,7 @@ def test_a_search_leaves_weights_with_a_card_and_walks_nothing_twice(monkeypatch
 @pytest.mark.parametrize("asked", ["json", "words"])
 def test_training_prints_the_errors_and_nothing_else(monkeypatch, capsys, tmp_path, asked):
     errors = {"raw": {"force": 2.0, "moment": 1.0}, "net": {"force": 0.5, "moment": 0.25}}
-    monkeypatch.setattr(nets, "train", lambda *args: SimpleNamespace(errors=errors, args=args))
+    monkeypatch.setattr(nets, "train_net", lambda *args: SimpleNamespace(errors=errors, args=args))
     more = ("--json",) if asked == "json" else ()
     assert call(monkeypatch, "train", "--out", tmp_path / "net.npz", *more) == 0
     out = capsys.readouterr().out
@@ -455,7 +457,7 @@ def test_the_table_is_made_and_made_again_without_a_walk(monkeypatch, capsys, tm
     flags += ("--steps", "2", "--step-plants", "1")
     assert call_table(monkeypatch, *flags) == 0
     first = (tmp_path / "runs/table/table.csv").read_bytes()
-    monkeypatch.setattr(verdicts, "walk_jobs", None)
+    monkeypatch.setattr(judging, "walk_jobs", None)
     monkeypatch.setattr(tunings, "_tune_on_cpu", None)
     monkeypatch.setattr(searches, "losses_on_hfs", pytest.fail)
     assert "along walks" in capsys.readouterr().err

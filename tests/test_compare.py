@@ -12,7 +12,7 @@ from hector_jax.cli import main as cli
 from hector_jax.cli.flags import Tune
 from hector_jax.cli.parse import as_table, from_file
 from hector_jax.report.compare import compare_runs, print_comparison
-from hector_jax.runs.folder import as_line, load_run, read_histories
+from hector_jax.store.folder import as_line, load_run, read_histories
 
 
 def change(median, counts=True):

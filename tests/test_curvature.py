@@ -22,7 +22,7 @@ from hector_jax.tuning.difftune import (
     update,
 )
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
-from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 
 NAMES = direction_names()
 OTHERS = ("turn_lead", "footstep_feedback", "horizontal_gain", "yaw_gain")
@@ -41,7 +41,7 @@ Z = 0.2 * np.random.default_rng(1).normal(size=22) * np.r_[np.ones(18), 0.1 * np
 def _rolled(command, z, direction):
     def walk(z):
         at = stepped(init(CONFIG, START).start, z, OTHERS)
-        found = rollout(CONFIG.rollout, ROBOT, at, command, ANCHOR, PLAIN)
+        found = rollout(CONFIG.rollout, Scenario(ROBOT, command, ANCHOR, PLAIN), at)
         return total(PAPER_LOSS, losses(PAPER_LOSS, found)), found
 
     return jax.jvp(walk, (z,), (direction,), has_aux=True)
@@ -54,7 +54,8 @@ def rolled(name, z, direction=np.zeros(22)):  # noqa: B008
 
 @pytest.fixture(scope="module")
 def objectives():
-    return [model_objective(CONFIG, ROBOT, named_command(name), ANCHOR, PLAIN) for name in COMMANDS]
+    scenarios = [Scenario(ROBOT, named_command(name), ANCHOR, PLAIN) for name in COMMANDS]
+    return [model_objective(CONFIG, scenario) for scenario in scenarios]
 
 
 def point(objective):
@@ -138,8 +139,9 @@ def equations(jaxpr):
 
 def test_the_tangents_share_the_factors_of_the_qps_and_form_no_matrices():
     config = replace(CONFIG.rollout, ticks=3, lead=2)
-    model = ROBOT, START, named_command("c"), ANCHOR, PLAIN, PAPER_LOSS
-    program = jax.make_jaxpr(partial(gauss_newton, config, others=OTHERS))(*model)
+    scenario = Scenario(ROBOT, named_command("c"), ANCHOR, PLAIN)
+    tangents = partial(gauss_newton, config, others=OTHERS)
+    program = jax.make_jaxpr(tangents)(scenario, START, PAPER_LOSS)
     needed, _ = dce_jaxpr(program.jaxpr, [True])  # as the compiler leaves it
     found = list(equations(needed))
     for name in ("cholesky", "triangular_solve"):

@@ -331,7 +331,7 @@ def test_the_legs_get_what_the_wrench_does_not_explain(three, robot):
     )
     wrench = jax.tree.map(lambda w: jnp.asarray(w[walk, j]), three.effect)
     feet = jnp.asarray(three.feet[walk, j - 1 : j + 1].mean(axis=0))
-    push = srbm.unexplained(robot, before, after, wrench, feet, 0.01)
+    push = srbm.unexplained(robot, before, after, wrench, feet, dt=0.01)
     leaves_close(turn(push, -before.euler[2]), jax.tree.map(lambda x: x[row], data.legs), 1e-8)
 
 

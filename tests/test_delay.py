@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hector_jax.core.inputs import InputError
-from hector_jax.runs import metrics
+from hector_jax.verdict import metrics
 
 
 def test_each_change_walks_with_each_delay_and_seed(monkeypatch, tmp_path):

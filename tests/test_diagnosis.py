@@ -20,17 +20,18 @@ from hector_jax.control.weights import nominal
 from hector_jax.core.inputs import InputError
 from hector_jax.report.report import render
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import metrics, tunings, verdicts
-from hector_jax.runs.setup import Setup
 from hector_jax.sim import diagnosis
 from hector_jax.sim.diagnosis import Fall, Record, likeliest_cause, not_the_weights
 from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
+from hector_jax.store import tunings
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import PAPER_LOSS
+from hector_jax.verdict import judging, metrics
 
 ROBOT, STRAIGHT = load_robot(), named_command("straight")
 JOB = Job(nominal(), STRAIGHT, hfs(), 1.0)
@@ -190,7 +191,7 @@ def test_a_start_that_falls_is_refused_before_anything_is_collected(monkeypatch,
         made.extend(jobs)
         yield from (pretend_walk(fall_at=0.5 if job.command is S else None) for job in jobs)
 
-    monkeypatch.setattr(verdicts, "walk_jobs", walks_of)
+    monkeypatch.setattr(judging, "walk_jobs", walks_of)
     monkeypatch.setattr(tuning, "fall_of", lambda *args: FALL)
     both = [NamedCommand(name, named_command(name)) for name in ("straight", "s")]
     S = both[1].command
@@ -204,7 +205,7 @@ def test_a_start_that_falls_is_refused_before_anything_is_collected(monkeypatch,
         assert len(made) == 2
         # a run walks its sets there later, and reads the walk of the start
         inputs = setup, {"nominal": nominal()}, both[0].command, [hfs()], [0]
-        verdicts.judge(*inputs, title="", folder=tmp_path)
+        judging.judge(*inputs, title="", folder=tmp_path)
     assert len(made) == 2
 
 
@@ -222,10 +223,10 @@ def test_a_tuned_set_that_walks_worse_than_nominal_is_told(capsys):
         score = metrics.score_like()
         score = score._replace(losses=score.losses | {"L": np.array(L)})
         last = pretend_walk().initial
-        return [verdicts.ScoredWalk(score, np.array(4.0), last, "", "")]
+        return [judging.ScoredWalk(score, np.array(4.0), last, "", "")]
 
     walks = {"nominal": scored(2e6), "without": scored(3e6), "with": scored(1e6)}
-    tuning._say_worse("straight", verdicts.ScoredWalks(walks, {}))
+    tuning._say_worse("straight", judging.ScoredWalks(walks, {}))
     said = capsys.readouterr().err
     assert "straight: on the high-fidelity simulator `without` walks with L 3e6, nominal" in said
     assert "`with`" not in said
@@ -260,11 +261,11 @@ def test_an_evaluation_has_the_fall_before_t_0_and_tells_it_once_a_set(
             made.append(job.seed)
             yield pretend_walk(1, seconds=1.0) if job.seed == 1 else fallen_at_once(job.seed)
 
-    monkeypatch.setattr(verdicts, "walk_jobs", walks_of)
-    monkeypatch.setattr(verdicts, "fall_of", lambda *args: FALL)
+    monkeypatch.setattr(judging, "walk_jobs", walks_of)
+    monkeypatch.setattr(judging, "fall_of", lambda *args: FALL)
     for _ in range(2):  # as walked, and from the folder
         with ThreadPoolExecutor(1) as pool:
-            found = verdicts.judge(
+            found = judging.judge(
                 Setup(pool, TuneConfig(), ROBOT),
                 {"mine": nominal()},
                 STRAIGHT,

@@ -14,7 +14,7 @@ from hector_jax.grfm.effect import Window, ground_effect
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.evaluate import evaluate_jit
 from hector_jax.tuning.loss import PAPER_LOSS
-from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 
 ROBOT = load_robot()
 ANCHOR = standing_anchor(ROBOT)
@@ -73,7 +73,8 @@ def test_steady_errors_go():
     last = []
     for gains in (dict.fromkeys(GAINS, 0.0), GAINS):
         weights = nominal()._replace(others=gains)
-        walked = walk(config, ROBOT, weights, named_command("straight"), ANCHOR, weak)
+        scenario = Scenario(ROBOT, named_command("straight"), ANCHOR, weak)
+        walked = walk(config, scenario, weights)
         assert not walked.fallen.any()
         end = jax.tree.map(
             lambda x, y: np.mean(x[-80:] - y[-80:], 0), walked.state, walked.reference
@@ -94,7 +95,8 @@ def test_gradients_of_all_numbers_are_those_of_differences():
 
     def evaluate(others):
         weights = start._replace(others=others)
-        return evaluate_jit(config, ROBOT, weights, named_command("s"), ANCHOR, weak, PAPER_LOSS)
+        scenario = Scenario(ROBOT, named_command("s"), ANCHOR, weak)
+        return evaluate_jit(config, scenario, weights, PAPER_LOSS)
 
     found = evaluate(start.others).gradient.others
     assert set(found) == set(names)

@@ -15,17 +15,17 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.headless import mujoco
 from hector_jax.robot.model import load_robot
-from hector_jax.runs.metrics import score
 from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Push, build_world, hfs, ideal
 from hector_jax.tuning.loss import PAPER_LOSS
+from hector_jax.verdict.metrics import score
 
 HECTOR = load_robot()
 CONFIG = walk_config(HECTOR)
 WORLDS = {"ideal": ideal, "hfs": hfs}
-NAMES = ("shared_mean", "c-alone")
+NAMES = ("without", "with")
 ROOT = Path(__file__).parents[1]
 FILES = [None, *(ROOT / "examples" / name / "robot.toml" for name in ("humanoid", "quadruped"))]
 
@@ -164,7 +164,7 @@ def test_an_engine_that_fails_says_so_and_stays_so(engine):
 
 @pytest.mark.slow
 def test_four_sets_rank_as_in_mujoco(engine):
-    folder = ROOT / "docs" / "batch" / "shared" / "weights"
+    folder = ROOT / "experiments" / "reports" / "best"
     sets = [nominal(), expert(), *(load_weights(folder / f"{n}.json") for n in NAMES)]
     ranks = [
         np.argsort([score(PAPER_LOSS, walk(CONFIG, HECTOR, one, build=build)).L for one in jobs])

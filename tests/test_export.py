@@ -34,11 +34,9 @@ from hector_jax.control.weights import expert, nominal, vector_to_weights, weigh
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, pack_wrench
-from hector_jax.qp import QP, Status
-from hector_jax.robot.model import load_robot
-from hector_jax.runs import export
-from hector_jax.runs.cache import robot_hash
-from hector_jax.runs.export import (
+from hector_jax.export import export
+from hector_jax.export.controller import Check, _measured, compare_with_live, record
+from hector_jax.export.export import (
     PLATFORMS,
     SCHEMA,
     TOLERANCE,
@@ -49,7 +47,9 @@ from hector_jax.runs.export import (
     weights_cpp,
     weights_schema,
 )
-from hector_jax.runs.export_controller import Check, _measured, check, record
+from hector_jax.qp import QP, Status
+from hector_jax.robot.model import load_robot
+from hector_jax.store.cache import robot_hash
 
 pytestmark = pytest.mark.usefixtures("on_cpu")
 ROBOT, CONFIG = load_robot(), WalkConfig()
@@ -255,7 +255,7 @@ def test_another_factor_or_order_would_be_noticed(spoilt):
 
 def test_the_page_says_what_the_cpp_controller_lacks_and_the_header_our_numbers():
     text = weights_cpp(nominal(), CONFIG, ROBOT, name="nominal")
-    page = (Path(__file__).parents[1] / "docs" / "export.md").read_text()
+    page = (Path(__file__).parents[1] / "docs" / "export-cpp.md").read_text()
     for fact in (
         "0.04 s",
         "9.0 kg",
@@ -266,7 +266,7 @@ def test_the_page_says_what_the_cpp_controller_lacks_and_the_header_our_numbers(
         "M_z",
     ):
         assert fact in page
-    for fact in ("steps of 0.03 s, 10 of them", "F_z <= M_y <=", "docs/export.md"):
+    for fact in ("steps of 0.03 s, 10 of them", "F_z <= M_y <=", "docs/export-cpp.md"):
         assert fact in text
     assert "ATTENTION" not in text
     about_weight = WalkConfig(mpc=MpcConfig(effort_reference="gravity"))
@@ -329,7 +329,7 @@ def loaded(exported):
 
 def test_the_loaded_controller_answers_as_the_live_one_did(loaded):
     walked = record(CONFIG, ROBOT, TUNED, command=named_command("s"), seconds=0.4)
-    found = check(CONFIG, *loaded, walked)
+    found = compare_with_live(CONFIG, *loaded, walked)
     assert max(found.force, found.moment, found.torque) <= TOLERANCE
     assert found.unsolved == 0
     assert np.abs(walked.wrench.force).max() > 100.0
@@ -371,7 +371,7 @@ YAWS = {
 @pytest.mark.parametrize("see", YAWS.values(), ids=YAWS)
 def test_the_measured_yaw_may_be_of_any_turn(loaded, turning, see):
     assert abs(turning.measurement.state.euler[-1, 2]) > 3.3
-    found = check(CONFIG, *loaded, seen_as(turning, see))
+    found = compare_with_live(CONFIG, *loaded, seen_as(turning, see))
     assert max(found.force, found.moment, found.torque) <= TOLERANCE
     assert found.unsolved == 0
 
@@ -424,7 +424,7 @@ def test_a_yaw_that_is_no_number_is_seen_and_then_forgotten(loaded):
 def test_the_check_notices_other_weights(loaded, weights, part):
     """Also those that differ in the numbers of plan and legs alone."""
     other = CONFIG.with_others(weights(), OTHERS)
-    found = check(
+    found = compare_with_live(
         CONFIG, *loaded, record(CONFIG, ROBOT, other, command=named_command("s"), seconds=0.1)
     )
     assert getattr(found, part) > {"force": 1.0, "torque": 0.1}[part]
@@ -508,7 +508,7 @@ def test_what_differs_from_the_live_controller_is_not_written(
 ):
     for part in ("export_controller", "record", "load_controller"):
         monkeypatch.setattr(export, part, lambda *args, **named: None)
-    monkeypatch.setattr(export, "check", lambda *known: found)
+    monkeypatch.setattr(export, "compare_with_live", lambda *known: found)
     assert call(monkeypatch, run) == 1
     assert fault in capsys.readouterr().err
     assert list((run / "export").glob("[!.]*")) == []

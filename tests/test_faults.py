@@ -21,9 +21,9 @@ from hector_jax.control.weights import nominal, weights_to_vector
 from hector_jax.core.inputs import InputError
 from hector_jax.report.run import tuning_section
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import tunings
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.tunings import Problem
+from hector_jax.store import tunings
+from hector_jax.store.setup import Setup
+from hector_jax.store.tunings import Problem
 from hector_jax.tuning import rollout
 from hector_jax.tuning.difftune import TuneConfig, descend
 from hector_jax.tuning.evaluate import Evaluation, Objective
@@ -81,8 +81,9 @@ def _(primals, tangents):
 step_carry = rollout.step_carry
 
 
-def planted(config, robot, weights, command, effect, carry, tick, variation=None):
+def planted(config, scenario, weights, carry, tick, *, wrench=None):
     """`step_carry` with the fault that the command names."""
+    command = scenario.command
     flat = [weights_to_vector(w) for w in (weights, nominal())]
     far = jnp.max(jnp.abs(jnp.log(flat[0] / flat[1]))) > command.velocity[1, 1]
     now = far & (tick == command.velocity[1, 0])
@@ -96,7 +97,7 @@ def planted(config, robot, weights, command, effect, carry, tick, variation=None
     weights = weights._replace(R=weights.R._replace(force=curved))
     # a QP without a price, solved by any wrench
     weights = jax.tree.map(lambda w: jnp.where(is_now(Fault.FLAT), 0.0, w), weights)
-    return step_carry(config, robot, weights, walked, effect, carry, tick, variation)
+    return step_carry(config, scenario._replace(command=walked), weights, carry, tick)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -120,7 +121,7 @@ REACH = {"gauss_newton": 0.3, "relative": 0.03}  # a full step goes beyond it, s
 def tune(command, params, config=CONFIG, robot=ROBOT):
     """The tuning as a run does it; with the lines that it left."""
     with ThreadPoolExecutor(1) as pool, TemporaryDirectory() as kept:
-        found = tunings.tune(
+        found = tunings.tune_all(
             Setup(pool, config, robot),
             {"with": Problem((command,), params)},
             Path(kept),

@@ -13,7 +13,7 @@ from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal
 from hector_jax.grfm.dataset import at_interval, make_dataset
 from hector_jax.grfm.effect import last_command
-from hector_jax.grfm.training import errors, report
+from hector_jax.grfm.training import errors, errors_by_phi
 from hector_jax.report import fidelity
 from hector_jax.report.report import Picture
 from hector_jax.robot.model import load_robot
@@ -99,7 +99,7 @@ def test_what_follows_a_fall_is_not_predicted(robot, walks):
 def test_the_report_holds_every_world_and_phi(tmp_path, samples, drifts):
     effects = {"raw": last_command}
     found = fidelity.as_result(
-        report(effects, samples), fidelity.by_phase(effects, samples), drifts
+        errors_by_phi(effects, samples), fidelity.by_phase(effects, samples), drifts
     )
     worlds = {"hfs": found, "standin": found}
     text = fidelity.write_report(tmp_path, worlds, [Picture("a.png", "A picture.")]).read_text()
@@ -122,7 +122,7 @@ def test_what_nothing_was_measured_of_is_null_and_a_dash(tmp_path, robot, sample
     effects = {"raw": last_command}
     phis = {**effects, "measured": None}
     found = fidelity.as_result(
-        report(effects, some),
+        errors_by_phi(effects, some),
         fidelity.by_phase(effects, some),
         {n: fidelity.drift(robot, e, fell, np.zeros(1, int)) for n, e in phis.items()},
     )

@@ -18,11 +18,11 @@ from hector_jax.control.controller import walk_config
 from hector_jax.control.legs import stance_torques
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import FEET, State, Wrench, pack_wrench
+from hector_jax.importing.propose import propose_robot
+from hector_jax.importing.remarks import remarks
+from hector_jax.importing.survey import survey_file
 from hector_jax.robot import srbm
 from hector_jax.robot.description import description_of
-from hector_jax.robot.importer.propose import propose
-from hector_jax.robot.importer.remarks import remarks
-from hector_jax.robot.importer.survey import survey_file
 from hector_jax.robot.kinematics import foot_poses, leg_gravity
 from hector_jax.robot.model import compile_model, load_robot, robot_of
 
@@ -52,7 +52,7 @@ def changed(folder, *changes):
 
 
 def test_the_example_is_what_is_proposed_for_its_model():
-    proposal = propose(MODEL)
+    proposal = propose_robot(MODEL)
     assert proposal.wrong == ()
     assert proposal.table == tomllib.loads(TABLE)
     assert proposal.survey.forwards == (False, False)
@@ -70,7 +70,7 @@ def test_legs_are_found_in_any_order_and_by_any_name(tmp_path):
     found = survey_file(path)
     names = [[found.model.joint(j).name for j in leg] for leg in found.legs]
     assert names == [joints_of(f"part{i}") for i in range(4)]
-    assert propose(path).wrong == ()
+    assert propose_robot(path).wrong == ()
 
 
 def test_a_urdf_with_four_legs_is_proposed(tmp_path):
@@ -82,7 +82,7 @@ def test_a_urdf_with_four_legs_is_proposed(tmp_path):
 
 
 def test_motors_without_armature_get_one_by_their_torque(tmp_path):
-    proposal = propose(changed(tmp_path, (' armature="0.01"', "")))
+    proposal = propose_robot(changed(tmp_path, (' armature="0.01"', "")))
     assert proposal.table["joints"]["armature"] == pytest.approx(
         2e-4 * ROBOT.torque_limit[:3], rel=5e-3
     )
@@ -98,7 +98,7 @@ HIND_KNEES = (r'(?=<joint name="hind_\w+_knee")<joint', '<joint range="0.83776 2
 
 def test_hind_knees_that_bend_the_other_way_are_told_and_stand(tmp_path, monkeypatch, capsys):
     path = changed(tmp_path, HIND_KNEES, HIND_PITCH)
-    proposal = propose(path)
+    proposal = propose_robot(path)
     assert proposal.wrong == ()
     assert proposal.survey.forwards == (False, True)
     angles = proposal.table["standing"]

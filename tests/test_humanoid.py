@@ -17,17 +17,17 @@ from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
-from hector_jax.grfm.dataset import at_interval
-from hector_jax.grfm.effect import last_command
-from hector_jax.robot.model import load_robot
-from hector_jax.runs.export import (
+from hector_jax.export.controller import compare_with_live, record
+from hector_jax.export.export import (
     TOLERANCE,
     controller,
     export_controller,
     load_controller,
     weights_schema,
 )
-from hector_jax.runs.export_controller import check, record
+from hector_jax.grfm.dataset import at_interval
+from hector_jax.grfm.effect import last_command
+from hector_jax.robot.model import load_robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import walk
@@ -170,7 +170,7 @@ def check_export(robot):
     example = controller(config, robot, weights)[1]
     loaded = load_controller(export_controller(config, robot, weights)), example
     walked = record(config, robot, weights, command=named_command("s"), seconds=0.4)
-    found = check(config, *loaded, walked)
+    found = compare_with_live(config, *loaded, walked)
     assert max(found.force, found.moment, found.torque) <= TOLERANCE
     assert found.unsolved == 0
 

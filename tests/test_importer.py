@@ -15,13 +15,13 @@ from hector_jax.cli.main import main
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import as_toml
 from hector_jax.core.tree_file import save_tree
+from hector_jax.importing.propose import propose_robot
+from hector_jax.importing.remarks import remarks
+from hector_jax.importing.survey import survey_file
+from hector_jax.importing.table import table_of
 from hector_jax.robot.description import read_description
-from hector_jax.robot.importer.propose import propose
-from hector_jax.robot.importer.remarks import remarks
-from hector_jax.robot.importer.source import build_spec
-from hector_jax.robot.importer.survey import survey_file
-from hector_jax.robot.importer.table import table_of
 from hector_jax.robot.model import compile_model, load_robot
+from hector_jax.robot.source import build_spec
 
 HUMANOID = Path(__file__).parents[1] / "examples" / "humanoid" / "humanoid.xml"
 
@@ -39,7 +39,7 @@ def edited(folder, *changes, **parts):
 
 def told(path):
     """The remarks on a proposed robot, which can be used."""
-    proposal = propose(path)
+    proposal = propose_robot(path)
     assert proposal.error is None
     return remarks(proposal.robot)
 
@@ -66,7 +66,7 @@ def shapes(model, body):
 )
 def test_a_disc_becomes_the_largest_box_in_it(tmp_path, shape, size):
     path = edited(tmp_path, ('type="cylinder" size="0.03 0.08"', shape))
-    model = build_spec(propose(path).robot.description).spec.compile()
+    model = build_spec(propose_robot(path).robot.description).spec.compile()
     (box,) = [x for kind, x in shapes(model, "left_thigh") if kind == mujoco.mjtGeom.mjGEOM_BOX]
     np.testing.assert_allclose(box, size)
 
@@ -74,7 +74,7 @@ def test_a_disc_becomes_the_largest_box_in_it(tmp_path, shape, size):
 def test_excluded_pairs_do_not_touch(tmp_path):
     pair = '<contact><exclude body1="left_thigh" body2="right_thigh"/></contact>'
     wide = ('type="cylinder" size="0.03 0.08"', 'type="capsule" size="0.11 0.02"')
-    proposal = propose(edited(tmp_path, wide, more=pair))
+    proposal = propose_robot(edited(tmp_path, wide, more=pair))
     model = build_spec(proposal.robot.description).spec.compile()
     assert model.nexclude == 1
     assert not [line for line in remarks(proposal.robot) if "overlap" in line]
@@ -114,7 +114,7 @@ def test_a_slide_in_a_leg_is_named(tmp_path):
 def test_a_fixed_frame_whose_inertia_no_body_has_is_a_point_mass(tmp_path, mass, inertia):
     frame = f'<body name="imu" pos="0.1 0 0"><inertial pos="0 0 0" mass="{mass}" '
     frame += f'fullinertia="{inertia}"/></body>'
-    own, robot = (propose(edited(tmp_path, arm=arm)).robot for arm in ("", frame))
+    own, robot = (propose_robot(edited(tmp_path, arm=arm)).robot for arm in ("", frame))
     assert robot.mass == pytest.approx(float(own.mass) + mass * (mass > 1e-6), rel=1e-12)
     np.testing.assert_allclose(robot.inertia, own.inertia, atol=1e-9 if mass < 1e-6 else 0.1)
 
@@ -127,7 +127,7 @@ def test_a_link_that_moves_needs_an_inertia(tmp_path):
 
 def test_hundreds_of_fixed_frames_are_taken(tmp_path):
     frames = "".join(f'<body name="frame{i}" pos="0 0 0.001"/>' for i in range(400))
-    robot = propose(edited(tmp_path, arm=frames)).robot
+    robot = propose_robot(edited(tmp_path, arm=frames)).robot
     (note,) = [x for x in build_spec(robot.description).notes if "made one" in x]
     assert note.endswith(", frame9, frame10 and 390 more")  # and the cap of a foot before them
 
@@ -157,7 +157,7 @@ def test_the_compiler_of_a_urdf_counts(tmp_path):
 
 def test_a_hinge_is_a_line(tmp_path):
     """Knee, ankle and hip of the right leg are moved along their own axes."""
-    own = propose(edited(tmp_path))
+    own = propose_robot(edited(tmp_path))
     moved = [
         (r'(name="right_knee" axis="0 1 0")', r'\1 pos="0 0.08 0"'),
         (
@@ -166,7 +166,7 @@ def test_a_hinge_is_a_line(tmp_path):
         ),
         (r'(name="right_roll" axis="1 0 0")', r'\1 pos="0.06 0 0"'),
     ]
-    proposal = propose(edited(tmp_path, *moved))
+    proposal = propose_robot(edited(tmp_path, *moved))
     assert proposal.error is None
     assert proposal.table["standing"] == own.table["standing"]
     assert proposal.robot.standing_height == pytest.approx(own.robot.standing_height, abs=1e-9)
@@ -211,7 +211,7 @@ UNLIKE = {  # changes, joint, what is told
 @pytest.mark.parametrize("kind", UNLIKE)
 def test_legs_that_are_no_mirror_images_are_told_joint_by_joint(tmp_path, kind):
     old, new, joint, text = UNLIKE[kind]
-    proposal = propose(edited(tmp_path, (old, new)))
+    proposal = propose_robot(edited(tmp_path, (old, new)))
     lines = [x for x in remarks(proposal.robot) if "mirror" in x]
     expected = f"left_{joint} and right_{joint} are no mirror images: {text}"
     assert any(re.match(expected, line) for line in lines), lines
@@ -250,14 +250,14 @@ def test_opposite_axes_of_mirrored_joints_are_alike(tmp_path):
 
 def test_knees_bend_from_the_straight_leg(tmp_path):
     plain = r'(name="\w+_ankle" axis="0 1 0") range="-1 1" pos="0 0 0.01"', r'\1 range="-1.9 1.9"'
-    own = propose(edited(tmp_path, plain))
+    own = propose_robot(edited(tmp_path, plain))
     crouch = [
         plain,
         (r'(<body name="\w+_shin" pos="0 0 -0.2")>', r'\1 euler="0 0.9 0">'),
         (r'(<body name="\w+_foot" pos="0 0 -0.2")>', r'\1 euler="0 -0.9 0">'),
         ('range="-0.1 2"', 'range="-1 1.1"'),
     ]
-    proposal = propose(edited(tmp_path, *crouch))
+    proposal = propose_robot(edited(tmp_path, *crouch))
     assert proposal.survey.forwards == own.survey.forwards == (True,)
     assert proposal.table["standing"]["left_knee"] == pytest.approx(0.1, abs=1e-3)
     assert proposal.robot.standing_height == pytest.approx(own.robot.standing_height, abs=1e-3)
@@ -275,19 +275,19 @@ def test_units_and_placeholders_are_told(tmp_path):
     (line,) = [x for x in told(edited(tmp_path, strong)) if "placeholder" in x]
     assert "left_knee 3000" in line
     heavy = ('mass="4" diag', 'mass="4000" diag'), ('mass="3" diag', 'mass="3000" diag')
-    proposal = propose(edited(tmp_path, *heavy))
+    proposal = propose_robot(edited(tmp_path, *heavy))
     assert any("write kg and m" in x for x in remarks(proposal.robot))
 
 
 def test_a_biped_that_cannot_yaw_is_told(tmp_path):
     assert [x for x in told(edited(tmp_path)) if "turns about z" in x]
     turned = (r'(name="\w+_roll" axis=)"1 0 0"', r'\1"0 0 1"')
-    proposal = propose(edited(tmp_path, turned))
+    proposal = propose_robot(edited(tmp_path, turned))
     assert not [x for x in remarks(proposal.robot) if "turns about z" in x]
 
 
 def refused(path):
-    proposal = propose(path)
+    proposal = propose_robot(path)
     assert proposal.error in proposal.wrong
     return proposal.error
 
@@ -349,7 +349,7 @@ FOUR = tuple((x, y) for x in (0.2, -0.2) for y in (0.1, -0.1))
 @pytest.mark.parametrize("places", [FOUR[:2], FOUR])
 @pytest.mark.parametrize("foot", ["", BALL])
 def test_legs_of_three_joints_stand_on_points(tmp_path, places, foot):
-    proposal = propose(stilts(tmp_path, places, foot))
+    proposal = propose_robot(stilts(tmp_path, places, foot))
     assert proposal.error is None
     assert [len(sole.contacts) for sole in proposal.soles] == [1] * len(places)
     assert bool(proposal.wrong) == (not foot)
@@ -369,7 +369,7 @@ def test_a_draft_has_what_was_found_and_what_is_to_be_mended(monkeypatch, capsys
     assert draft["feet"]["left"]["body"] == "left_foot"
     assert "has no range" in capsys.readouterr().err
     unlike = ('(?s)(right_foot.*?)size="0.06 0.03 0.01"', r'\1size="0.09 0.03 0.01"')
-    proposal = propose(edited(tmp_path, unlike))
+    proposal = propose_robot(edited(tmp_path, unlike))
     assert "expected the same" in proposal.wrong[0]
     assert proposal.table["joints"]["left"] == JOINTS[:4]
     (tmp_path / "none.xml").write_text("<mujoco><worldbody/></mujoco>")
@@ -382,10 +382,10 @@ def test_what_a_hand_written_file_leaves_out_is_filled_in_by_the_rules(
     monkeypatch, capsys, tmp_path
 ):
     model = edited(tmp_path)
-    full = propose(model).table
+    full = propose_robot(model).table
     path, out = tmp_path / "own.toml", tmp_path / "full.toml"
     path.write_text('model = "robot.xml"\n[gait]\nstance = 24\n[weights.nominal]\neuler = 7\n')
-    proposal = propose(path)
+    proposal = propose_robot(path)
     assert proposal.error is None
     expected = {**full, "name": "own", "gait": full["gait"] | {"stance": 24}}
     weights = full["weights"]["nominal"] | {"euler": 7}
@@ -397,7 +397,7 @@ def test_what_a_hand_written_file_leaves_out_is_filled_in_by_the_rules(
     assert "left out " in capsys.readouterr().out
     assert command(monkeypatch, path, "--out", out) == 0
     assert load_robot(out).mass == pytest.approx(float(proposal.robot.mass), rel=1e-6)
-    assert not propose(out).filled
+    assert not propose_robot(out).filled
 
 
 def test_legs_that_a_file_names_are_taken(tmp_path):
@@ -409,7 +409,7 @@ def test_legs_that_a_file_names_are_taken(tmp_path):
     text = "\n".join(f"{side} = {names}" for side, names in joints.items())
     path = tmp_path / "own.toml"
     path.write_text(f'model = "{model.name}"\n[joints]\n{text}\n')
-    proposal = propose(path)
+    proposal = propose_robot(path)
     assert proposal.table["joints"]["left"] == joints["left"]
     assert "left_ankle" in proposal.table["joints"]["weld"]
 
@@ -445,9 +445,9 @@ def test_the_standard_form_is_read_as_it_is_and_is_the_same_robot(monkeypatch, t
     assert build_spec(description).notes == ()
     assert description.standing == description.standing_key
     assert description.weld == description.armature == ()
-    proposal = propose(model)
+    proposal = propose_robot(model)
     own, robot = proposal.robot, load_robot(out)
-    again = propose(tmp_path / "new-standard.xml").table
+    again = propose_robot(tmp_path / "new-standard.xml").table
     for section, key in (("mpc", "inertia_share"), ("legs", "kp"), ("legs", "kd")):
         np.testing.assert_allclose(again[section][key], proposal.table[section][key], rtol=0.02)
     assert robot.structure == own.structure
@@ -468,7 +468,7 @@ def test_robots_whose_files_have_one_name_do_not_share_data(tmp_path):
     for path, mass in zip(paths, ("4", "5"), strict=True):
         path.parent.mkdir()
         model = edited(path.parent, ('mass="4" diag', f'mass="{mass}" diag'))
-        path.write_text(as_toml(propose(model).table, []))
+        path.write_text(as_toml(propose_robot(model).table, []))
         robots.append(load_robot(path))
     assert [robot.description.name for robot in robots] == ["robot", "robot"]
     first, second = (data_folder(data, *pair) for pair in zip(paths, robots, strict=True))

@@ -31,8 +31,8 @@ from hector_jax.grfm.training import TrainConfig
 from hector_jax.qp import QpConfig
 from hector_jax.report.video import VideoConfig
 from hector_jax.robot.model import load_robot
-from hector_jax.runs.nets import CollectConfig
 from hector_jax.search.cmaes import SearchConfig
+from hector_jax.store.nets import CollectConfig
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
 
@@ -299,7 +299,7 @@ def spoilt(data, path):
 def net(folder):
     """A small net of zeros."""
     path = folder / "sound-net.npz"
-    like = network.layout("paper", (3,), WalkConfig())
+    like = network.empty_params("paper", (3,), WalkConfig())
     network.save_net(path, like, robot=ROBOT, about={})
     return path
 

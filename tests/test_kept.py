@@ -13,14 +13,15 @@ from hector_jax.control.parameters import bounds
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import metrics, tunings, verdicts
-from hector_jax.runs.cache import content_key
-from hector_jax.runs.folder import as_line
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.tunings import Problem, Tuned
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs, ideal
+from hector_jax.store import tunings
+from hector_jax.store.cache import content_key
+from hector_jax.store.folder import as_line
+from hector_jax.store.setup import Setup
+from hector_jax.store.tunings import Problem, Tuned
 from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.verdict import judging, metrics
 
 ROBOT, CONFIG, S = load_robot(), TuneConfig(), named_command("s")
 POOL = ThreadPoolExecutor(1)  # never asked
@@ -61,20 +62,20 @@ def walked(monkeypatch):
             yield pretend_walk(job.seed, float(job.weights.Q.euler[0]) / 1e4, 1.0, fall_at=fall_at)
 
     walks_of.cut = None
-    monkeypatch.setattr(verdicts, "walk_jobs", walks_of)
+    monkeypatch.setattr(judging, "walk_jobs", walks_of)
     return seeds, walks_of
 
 
 def tune(folder, config=CONFIG, command=S, start=None):
     problems = {"without": Problem((command,), None)}
     setup = Setup(POOL, config, ROBOT, "abc")
-    return tunings.tune(setup, problems, folder, title="", start=start)["without"]
+    return tunings.tune_all(setup, problems, folder, title="", start=start)["without"]
 
 
 def judge(folder, sets, seeds=(0, 1, 2), plant=None, commit="abc"):
     plants = [plant or hfs()] * len(seeds)
     setup = Setup(POOL, CONFIG, ROBOT, commit)
-    return verdicts.judge(setup, sets, S, plants, seeds, title="", folder=folder)
+    return judging.judge(setup, sets, S, plants, seeds, title="", folder=folder)
 
 
 def test_a_tuning_comes_back_as_it_was(tmp_path, tuned):
@@ -113,7 +114,7 @@ def test_metrics_of_a_run_that_was_cut_are_those_of_an_uncut_one(tmp_path, tuned
     def lines(folder, problems):
         folder.mkdir(exist_ok=True)
         setup = Setup(POOL, CONFIG, ROBOT)
-        tunings.tune(setup, problems, folder, title="", metrics=folder / "metrics.jsonl")
+        tunings.tune_all(setup, problems, folder, title="", metrics=folder / "metrics.jsonl")
         return (folder / "metrics.jsonl").read_text()
 
     whole = lines(tmp_path / "whole", problems)
@@ -193,7 +194,7 @@ def test_a_walk_with_an_unsolved_qp_is_said(tmp_path, monkeypatch, capsys, resid
             walk = pretend_walk(job.seed, 0.03, 1.0)
             yield walk._replace(residual=np.where(job.seed == 1, residual, walk.residual))
 
-    monkeypatch.setattr(verdicts, "walk_jobs", walks_of)
+    monkeypatch.setattr(judging, "walk_jobs", walks_of)
     for _ in range(2):  # as walked, and as kept
         judge(tmp_path, {"mine": nominal()})
         said = " ".join(capsys.readouterr().err.split())

@@ -26,18 +26,20 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.part import Part
 from hector_jax.qp import INTERIOR_POINT, QpConfig, Solver
 from hector_jax.robot.description import TuningSettings
-from hector_jax.runs import nets, searches, verdicts, walks
-from hector_jax.runs.cache import content_key, robot_hash
-from hector_jax.runs.campaign import Campaign
-from hector_jax.runs.nets import CollectConfig, collection_settings
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.tunings import tune_config
 from hector_jax.search.cmaes import SearchConfig
 from hector_jax.sim.engine import ENGINES, MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
+from hector_jax.store import nets
+from hector_jax.store.cache import content_key, robot_hash
+from hector_jax.store.nets import CollectConfig, collection_settings
+from hector_jax.store.setup import Setup
+from hector_jax.store.tunings import tune_config
 from hector_jax.tuning.loss import PAPER_LOSS, LossTerm
-from hector_jax.tuning.rollout import variation_of
+from hector_jax.tuning.rollout import Scenario, with_variation
+from hector_jax.verdict import judging
+from hector_jax.walk_tuning import searches, walks
+from hector_jax.walk_tuning.campaign import Campaign
 
 key = partial(content_key, code=())
 
@@ -51,8 +53,9 @@ def robot_with(**settings):
 def test_noise_and_delay_of_a_tuning_are_in_its_settings_and_keys(setting):
     noisy = robot_with(**setting)
     one, other = tune_config(ROBOT), tune_config(noisy)
-    assert variation_of(one.rollout) is None
-    assert variation_of(other.rollout) is not None
+    scenario = Scenario(ROBOT, None, None, None)
+    assert with_variation(one.rollout, scenario).variation is None
+    assert with_variation(other.rollout, scenario).variation is not None
     assert key(one) != key(other)
     assert robot_hash(ROBOT) != robot_hash(noisy)
     config = CollectConfig(engine="c")
@@ -256,8 +259,8 @@ def test_a_record_of_a_number_of_the_user_goes_on_in_its_box_only(monkeypatch, t
 
 
 def test_our_functions_and_installed_ones_have_their_names():
-    assert function_id(variation_of) == "hector_jax.tuning.rollout.variation_of"
-    assert function_id(jax.jit(variation_of)) == "hector_jax.tuning.rollout.variation_of"
+    assert function_id(with_variation) == "hector_jax.tuning.rollout.with_variation"
+    assert function_id(jax.jit(with_variation)) == "hector_jax.tuning.rollout.with_variation"
     assert function_id(np.linalg.norm).startswith("numpy.linalg.norm#")
 
 
@@ -320,7 +323,7 @@ def test_parts_whose_body_changed_have_other_keys():
     engines = [MUJOCO_C._replace(walk=walk) for walk in (walk_alone, walk_otherwise)]
     job = Job(nominal(), named_command("s"), hfs())
     names = {
-        verdicts._file_name(Setup(Executor(), CONFIG, ROBOT), ("a", 0), job, False, engine)
+        judging._file_name(Setup(Executor(), CONFIG, ROBOT), ("a", 0), job, False, engine)
         for engine in engines
     }
     assert len(names) == 2
@@ -353,7 +356,7 @@ def search(folder, engine, monkeypatch):
     commands = {"s": named_command("s")}
     setup = Setup(Executor(), CONFIG, ROBOT)
     options = {"commands": commands, "engine": engine, "folder": folder}
-    return searches.search(setup, config, nominal(), **options)
+    return searches.search_all(setup, config, nominal(), **options)
 
 
 def journal(folder, engine, monkeypatch):
@@ -420,8 +423,8 @@ def version_of(monkeypatch):
     [
         (("grfm.training",), ("flax", "optax", "jax", "jaxlib", "numpy")),
         (("tuning.difftune",), ("optax", "jaxopt", "scipy")),
-        (("runs.searches", "sim.walk"), ("cmaes", "mujoco")),
-        (("runs.walks",), ("cmaes", "tinygp", "scipy")),
+        (("walk_tuning.searches", "sim.walk"), ("cmaes", "mujoco")),
+        (("walk_tuning.walks",), ("cmaes", "tinygp", "scipy")),
         (ENGINES["mjx"].modules, ("mujoco-mjx",)),
         (ENGINES["drake"].modules, ("drake",)),
         (ENGINES["pinocchio"].modules, ("pin",)),

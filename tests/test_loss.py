@@ -16,11 +16,11 @@ from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.grfm.effect import last_command
 from hector_jax.report.report import render
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import metrics
-from hector_jax.runs.folder import as_line
+from hector_jax.store.folder import as_line
 from hector_jax.tuning.difftune import TuneConfig, tune
 from hector_jax.tuning.loss import PAPER_LOSS, LossTerm, losses, switch_loss, total, with_alphas
-from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.rollout import RolloutConfig, Scenario
+from hector_jax.verdict import metrics
 
 NAMES = ["L_Eul", "L_pos", "L_ctrl"]
 parts_of, switches_of = jax.jit(partial(losses, PAPER_LOSS)), jax.jit(switch_loss)
@@ -181,9 +181,8 @@ def test_a_fourth_term_is_tuned_told_and_written_from_one_place():
     loss = (*PAPER_LOSS, LossTerm("L_sway", "m^2/s^2", 1e4, sway_loss))
     config = TuneConfig(rollout=RolloutConfig(ticks=20), loss=loss, iterations=1)
     robot = load_robot()
-    tuning = tune(
-        config, robot, nominal(), named_command("s"), standing_anchor(robot), last_command
-    )
+    scenario = Scenario(robot, named_command("s"), standing_anchor(robot), last_command)
+    tuning = tune(config, scenario, nominal())
     first = tuning.iterations[0]
     terms = first.evaluation.terms
     assert terms["L_sway"] > 0.0
@@ -192,7 +191,7 @@ def test_a_fourth_term_is_tuned_told_and_written_from_one_place():
     assert line["L_sway"] == pytest.approx(float(terms["L_sway"]))
     walks = [metrics.score(loss, pretend_walk())] * 2
     verdict = metrics.make_verdict(loss, [0, 1], {"s": {"nominal": walks, "mine": walks}})
-    result = metrics.as_result(verdict)
+    result = metrics.verdict_result(verdict)
     assert result["alpha"]["L_sway"] == 1e4
     mean = result["sets"]["mine"]["standin"]["L_sway"]["mean"]
     assert mean == walks[0].losses["L_sway"]

@@ -18,10 +18,10 @@ from hector_jax.control.weights import nominal, scale_weights, weights_to_vector
 from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import save_tree
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import metrics, verdicts
-from hector_jax.runs.campaign import Campaign
 from hector_jax.sim.world import named_world
 from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.verdict import judging, metrics
+from hector_jax.walk_tuning.campaign import Campaign
 
 GOAL = scale_weights(nominal(), np.linspace(-0.5, 0.5, 18))
 
@@ -113,7 +113,7 @@ def test_the_report_compares_the_sets_on_both_groups_of_plants(tmp_path, monkeyp
             scores[name] = rows
         return SimpleNamespace(scores=scores)
 
-    monkeypatch.setattr(verdicts, "judge", judge)
+    monkeypatch.setattr(judging, "judge", judge)
     monkeypatch.setattr(many_plants, "search", lambda pool, campaign, *_: campaign.start)
     monkeypatch.setattr(many_plants, "workers", lambda count: nullcontext())
     monkeypatch.setattr(sys, "argv", ["many_plants.py", "--plants", "4", "--out", str(tmp_path)])

@@ -7,8 +7,8 @@ import pytest
 from pretend import SETS, pretend_score, pretend_verdict, pretend_walk
 
 from hector_jax.core.files import as_json
-from hector_jax.runs import metrics
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
+from hector_jax.verdict import metrics
 
 
 def mean_of(x):
@@ -73,7 +73,7 @@ def test_fewer_than_four_samples_have_no_interval():
     four = metrics.bootstrap(mean_of, np.arange(4.0))
     assert four.text("{:.2f}".format) == f"1.50 [{four.low:.2f}, {four.high:.2f}]"
     verdict = _judge(nominal=[1.0], tuned=[0.5])
-    found = json.loads(as_json(metrics.as_result(verdict)))["sets"]["tuned"]["standin"]
+    found = json.loads(as_json(metrics.verdict_result(verdict)))["sets"]["tuned"]["standin"]
     assert found["L"] == {"mean": 0.5, "low": None, "high": None}
     change = found["change"]["nominal"]
     assert (change["median"], change["low"], change["high"]) == (pytest.approx(-50.0), None, None)
@@ -124,7 +124,7 @@ def test_three_plants_have_no_interval_on_however_many_trajectories():
 def test_the_seeds_of_a_result_are_its_plants_and_its_falls_and_wins_are_walks():
     verdict = pretend_verdict(4, {("with", 1)}, scenes=("straight", "c", "s"))
     assert verdict.walks == 12
-    found = metrics.as_result(verdict)["sets"]["with"]["standin"]
+    found = metrics.verdict_result(verdict)["sets"]["with"]["standin"]
     assert (found["seeds"], found["scenes"]) == ([0, 1, 2, 3], ["straight", "c", "s"])
     assert found["falls"] == 3
     losses = (verdict.scores[name].L for name in ("with", "without"))
@@ -158,7 +158,7 @@ def test_the_margin_of_falls_is_one_of_walks(fell, counts):
 
 
 def test_the_result_has_the_promised_keys_and_is_json():
-    result = json.loads(json.dumps(metrics.as_result(pretend_verdict()), allow_nan=False))
+    result = json.loads(json.dumps(metrics.verdict_result(pretend_verdict()), allow_nan=False))
     assert tuple(result["sets"]) == SETS
     for name, worlds in result["sets"].items():
         found = worlds["standin"]
@@ -178,14 +178,16 @@ def test_legs_that_touch_are_counted_up_to_a_fall():
     one = metrics.score(PAPER_LOSS, walk)
     assert one.legs_touch == pytest.approx(0.5)
     verdict = metrics.make_verdict(PAPER_LOSS, [0, 1], {"s": {"with": [one, one]}})
-    assert metrics.as_result(verdict)["sets"]["with"]["standin"]["legs_touch"] == pytest.approx(1.0)
+    assert metrics.verdict_result(verdict)["sets"]["with"]["standin"][
+        "legs_touch"
+    ] == pytest.approx(1.0)
 
 
 def test_the_result_of_a_set_that_falls_at_once_is_still_json():
     walk = metrics.score(PAPER_LOSS, pretend_walk(fall_at=-1.0))
     scores = {"s": {"nominal": [walk] * 2, "with": [walk] * 2}}
     verdict = metrics.make_verdict(PAPER_LOSS, [0, 1], scores)
-    found = metrics.as_result(verdict)["sets"]["with"]["standin"]
+    found = metrics.verdict_result(verdict)["sets"]["with"]["standin"]
     found = json.loads(as_json(found))
     assert found["falls"] == 2
     assert found["rms"]["position"] == [None] * 3

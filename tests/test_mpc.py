@@ -44,7 +44,7 @@ from hector_jax.core.trajectory import State, Wrench, pack_wrench, unpack_wrench
 from hector_jax.qp import QP, Status, solve_qp
 from hector_jax.robot import srbm
 from hector_jax.robot.model import load_robot
-from hector_jax.runs.cache import content_key
+from hector_jax.store.cache import content_key
 
 ROBOT = load_robot()
 CONFIG = MpcConfig()

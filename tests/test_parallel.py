@@ -16,7 +16,7 @@ from hector_jax.grfm.dataset import at_interval
 from hector_jax.robot.description import MODEL_PATH
 from hector_jax.robot.model import load_robot
 from hector_jax.sim import sensing
-from hector_jax.sim.loop import Job, effect_of
+from hector_jax.sim.loop import Job, contact_effect
 from hector_jax.sim.mjx_model import batched_model, find_places, in_floor, mjx, mjx_contacts
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.parallel import walk_batch
@@ -54,7 +54,7 @@ def recorded():
 @jax.jit
 def wrench_of(row, contacts, floor, foot_of_geom):
     ground = sensing.ground_of(contacts, floor, foot_of_geom, feet=2)
-    return effect_of(ROBOT, row, ground)
+    return contact_effect(ROBOT, row, ground)
 
 
 @pytest.mark.slow

@@ -20,7 +20,8 @@ from hector_jax.core.trajectory import State
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.parallel_rollout import _newton, _Step, parallel_rollout
-from hector_jax.tuning.rollout import RolloutConfig, no_variation, rollout, rollout_config
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout, rollout_config
+from hector_jax.tuning.variation import no_variation
 
 EFFECT = small_effect()
 FIELDS = "initial", "state", "reference", "command", "effect", "feet"
@@ -35,10 +36,11 @@ def noisy():
 @partial(jax.jit, static_argnums=(0, 1))
 def walked(walk, config, robot, effect, weights, variation=None):
     """A trajectory, and the gradient of a sum that all its numbers are in."""
-    command, anchor = named_command("s"), standing_anchor(robot)
+    anchor = standing_anchor(robot)
+    scenario = Scenario(robot, named_command("s"), anchor, effect, variation)
 
     def mixed(weights):
-        found = walk(config, robot, weights, command, anchor, effect, variation)
+        found = walk(config, scenario, weights)
         leaves = jax.tree.leaves([getattr(found, name) for name in FIELDS])
         rng = np.random.default_rng(0)
         return sum(jnp.sum(rng.normal(size=x.shape) * x) for x in leaves), found

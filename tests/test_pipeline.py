@@ -32,17 +32,18 @@ from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.grfm.paper import PaperParams
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import nets, searches, tunings
-from hector_jax.runs.metrics import score
-from hector_jax.runs.nets import CollectConfig
-from hector_jax.runs.setup import Setup
 from hector_jax.sim.engine import ENGINES, MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
+from hector_jax.store import nets, tunings
+from hector_jax.store.nets import CollectConfig
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import Evaluation, mean_objective
-from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.rollout import RolloutConfig, Scenario
+from hector_jax.verdict.metrics import score
+from hector_jax.walk_tuning import searches
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +85,7 @@ def test_no_walk_is_in_two_parts(tmp_path, robot):
     walks = [set(np.unique(part.walk)) for part in parts[:3]]
     assert all(walks)
     assert sum(map(len, walks)) == len(set.union(*walks)) == 5
-    net = nets.train(TrainConfig("paper", epochs=1), robot, tmp_path, tmp_path / "net.npz")
+    net = nets.train_net(TrainConfig("paper", epochs=1), robot, tmp_path, tmp_path / "net.npz")
     held = nets.held_out_walks(robot, net)
     assert set(np.asarray(held.job.seed)) == walks[2]
 
@@ -96,7 +97,7 @@ def test_a_net_that_learns_no_touchdowns_says_so_where_they_are_asked_for(tmp_pa
     collect(tmp_path, draw_jobs(0, 5), walks, robot=LEARNS_TOUCHDOWNS)
     for variant, says in (("linear", 1), ("gated", 0)):
         config, path = TrainConfig(variant), tmp_path / f"{variant}.npz"
-        nets.train(config, LEARNS_TOUCHDOWNS, tmp_path, path)
+        nets.train_net(config, LEARNS_TOUCHDOWNS, tmp_path, path)
         line = f"tuning.touchdown_error: the net {variant} does not learn where the feet land"
         assert capsys.readouterr().err.count(line) == says
 
@@ -124,7 +125,7 @@ def test_data_follow_from_their_own_settings_whatever_command_makes_them(tmp_pat
         made.append((config, folder))
         raise cut
 
-    monkeypatch.setattr(nets, "collect", collect)
+    monkeypatch.setattr(nets, "collect_walks", collect)
     monkeypatch.setattr(tunings, "compile_programs", lambda *args, **options: [])  # it walks
     for command in (
         flags.Tune(iterations=10, data=tmp_path / "data", out=tmp_path / "run"),
@@ -161,13 +162,13 @@ def test_walks_of_other_settings_are_refused(tmp_path, robot, others, message):
 def test_a_net_of_other_settings_or_other_walks_is_refused_and_stays(tmp_path, robot, quick):
     path = tmp_path / "grfm.npz"
     gather(tmp_path / "walks", robot)
-    nets.train(TrainConfig(epochs=2), robot, tmp_path / "walks", path)
+    nets.train_net(TrainConfig(epochs=2), robot, tmp_path / "walks", path)
     written = path.read_bytes()
     with pytest.raises(InputError, match="grfm.npz: made with epochs 2, this command expects 1;"):
         ground(tmp_path, robot)
     assert path.read_bytes() == written
     gather(tmp_path / "others", robot, draw=1)
-    nets.train(TrainConfig(epochs=1), robot, tmp_path / "others", path)
+    nets.train_net(TrainConfig(epochs=1), robot, tmp_path / "others", path)
     with pytest.raises(InputError, match="grfm.npz: made with content"):
         ground(tmp_path, robot)
 
@@ -175,7 +176,7 @@ def test_a_net_of_other_settings_or_other_walks_is_refused_and_stays(tmp_path, r
 def test_a_net_of_another_variant_is_refused_and_kept(tmp_path, robot):
     gather(tmp_path / "walks", robot)
     path = tmp_path / "grfm.npz"
-    nets.train(TrainConfig("paper", epochs=1), robot, tmp_path / "walks", path)
+    nets.train_net(TrainConfig("paper", epochs=1), robot, tmp_path / "walks", path)
     written = path.read_bytes()
     with pytest.raises(InputError, match="grfm.npz: holds grfm-paper, expected grfm-residual"):
         ground(tmp_path, robot)
@@ -187,7 +188,7 @@ def test_a_net_is_stored_by_its_variant(tmp_path, robot, quick, monkeypatch):
     path = nets.net_path(tmp_path, "paper")
     assert path == tmp_path / "grfm-paper.npz"
     gather(tmp_path / "walks", robot)
-    nets.train(TrainConfig("paper", epochs=1), robot, tmp_path / "walks", path)
+    nets.train_net(TrainConfig("paper", epochs=1), robot, tmp_path / "walks", path)
     monkeypatch.setattr(nets, "_train", None)  # nothing is to be trained again
     assert isinstance(ground(tmp_path, robot, "paper").params, PaperParams)
 
@@ -200,17 +201,17 @@ def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, m
     sizes = {"c": 1.0, "s": 1e3}
     commands = [named_command(name)._replace(duration=np.array([k])) for name, k in sizes.items()]
 
-    def tune_step(config, robot, weights, command, anchor, effect, variation=None):
+    def tune_step(config, scenario, weights):
         vector = np.asarray(weights_to_vector(weights))
-        (size,) = command.duration
+        (size,) = scenario.command.duration
         logs = np.log(vector) - (1.0 if size > 1.0 else -1.0)
         gradient = vector_to_weights(jnp.asarray(2.0 * size * logs / vector))
         loss = np.array(size * (logs @ logs))
         terms = dict.fromkeys(("L_Eul", "L_pos", "L_ctrl"), loss)
         return Evaluation(loss, terms, gradient, np.array(0.0), np.array(0.0))
 
-    def matrix(config, robot, weights, command, **model):
-        return 2.0 * float(command.duration[0]) * SHARED
+    def matrix(config, scenario, weights, loss, *, others):
+        return 2.0 * float(scenario.command.duration[0]) * SHARED
 
     monkeypatch.setattr(tunings.difftune, "tune_step", tune_step)
     monkeypatch.setattr(tunings.difftune, "gauss_newton_jit", matrix)
@@ -220,7 +221,8 @@ def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, m
         problem = tunings.Problem((commands[0], *others), None)
         found = tunings._tune_on_cpu(setup, nominal(), problem, lambda iteration: None)
         first = found.iterations[0].evaluation
-        each = [tune_step(None, None, nominal(), c, None, None) for c in (commands[0], *others)]
+        scenarios = [Scenario(robot, c, None, None) for c in (commands[0], *others)]
+        each = [tune_step(config, scenario, nominal()) for scenario in scenarios]
         mean = np.mean([one.loss for one in each])
         assert first.loss == pytest.approx(mean, rel=1e-12)
         scales = [one.loss / mean for one in each]
@@ -237,8 +239,8 @@ def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, m
 
 @pytest.mark.parametrize("falls", [{1}, {0, 1, 2}])
 def test_drawn_models_with_which_the_start_falls_are_left_out(robot, monkeypatch, capsys, falls):
-    def tune_step(config, robot, weights, command, anchor, effect, variation):
-        seed = int(variation.seed)
+    def tune_step(config, scenario, weights):
+        seed = int(scenario.variation.seed)
         loss, fallen = np.array(1.0 + seed), np.array(float(seed in falls))
         return Evaluation(loss, {}, nominal(), fallen, np.array(0.0))
 
@@ -272,7 +274,7 @@ def test_a_tuning_that_fails_is_told_while_others_go_on(tmp_path, monkeypatch, r
     problems = {"without": tunings.Problem(walks, None), "with": tunings.Problem(falls, None)}
     begin, pool = time.monotonic(), ThreadPoolExecutor(2)
     with pytest.raises(InputError, match="the starting weights fall"):
-        tunings.tune(Setup(pool, TuneConfig(), robot), problems, tmp_path, title="tuning")
+        tunings.tune_all(Setup(pool, TuneConfig(), robot), problems, tmp_path, title="tuning")
     assert time.monotonic() - begin < 15.0
     pool.shutdown(wait=False)
 

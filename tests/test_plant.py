@@ -20,8 +20,6 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import read_card
 from hector_jax.robot.description import PlantSizes
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import verdicts
-from hector_jax.runs.setup import Setup
 from hector_jax.sim import parallel
 from hector_jax.sim import walk as sim_walk
 from hector_jax.sim.loop import Job
@@ -29,7 +27,9 @@ from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs, ideal
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.verdict import judging
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 ARMS, STRIDER = EXAMPLES / "hector-v2" / "arms.toml", EXAMPLES / "strider" / "robot.toml"
@@ -119,7 +119,7 @@ def test_a_plant_of_other_joints_is_refused(engine):
 
 def test_scores_of_another_plant_are_others(monkeypatch, tmp_path, arms):
     monkeypatch.setattr(
-        verdicts, "walk_jobs", lambda *known: (pretend_walk(job.seed) for job in known[1])
+        judging, "walk_jobs", lambda *known: (pretend_walk(job.seed) for job in known[1])
     )
     known = {"nominal": nominal()}, STRAIGHT, [hfs()], [0]
     # another file with the very same numbers
@@ -127,7 +127,7 @@ def test_scores_of_another_plant_are_others(monkeypatch, tmp_path, arms):
     with ThreadPoolExecutor(1) as pool:
         for plant in (None, arms, arms, renamed):
             setup = Setup(pool, TuneConfig(), ROBOT)
-            verdicts.judge(setup, *known, title="", folder=tmp_path, plant=plant)
+            judging.judge(setup, *known, title="", folder=tmp_path, plant=plant)
     assert len(list(tmp_path.glob("*.npz"))) == 3
 
 
@@ -143,7 +143,7 @@ def test_the_command_line_takes_the_plant_and_names_it(monkeypatch, capsys, tmp_
         jobs.append((robot, job))
         return pretend_walk()
 
-    monkeypatch.setattr(verdicts, "walk_jobs", walks_of)
+    monkeypatch.setattr(judging, "walk_jobs", walks_of)
     monkeypatch.setattr(sim_walk, "walk", walk_one)
     words = ["evaluate", "--plant", ARMS, "--world", "hfs", "--out", tmp_path / "result.json"]
     assert call(monkeypatch, *words) == 0

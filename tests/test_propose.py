@@ -17,16 +17,16 @@ from hector_jax.cli.main import main
 from hector_jax.control.controller import walk_config
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import as_toml
+from hector_jax.importing.propose import HEIGHT, MASS, propose_robot
+from hector_jax.importing.remarks import remarks
+from hector_jax.importing.soles import find_soles
+from hector_jax.importing.survey import survey_file
 from hector_jax.robot.description import (
     DESCRIPTION_PATH,
     MODEL_PATH,
     description_of,
     read_description,
 )
-from hector_jax.robot.importer.propose import HEIGHT, MASS, propose
-from hector_jax.robot.importer.remarks import remarks
-from hector_jax.robot.importer.soles import find_soles
-from hector_jax.robot.importer.survey import survey_file
 from hector_jax.robot.model import compile_model, load_robot, robot_of
 from hector_jax.robot.response import response, swing_frequency
 from hector_jax.tuning.loss import loss_of_robot
@@ -64,7 +64,7 @@ def standing(robot):
 @pytest.mark.parametrize("path", [DESCRIPTION_PATH, STRIDER, HUMANOID], ids=lambda p: p.parent.name)
 def test_a_proposal_loads_and_names_joints_and_feet_as_the_robots_own_toml(path):
     own = read_description(path)
-    proposal = propose(own.model)
+    proposal = propose_robot(own.model)
     assert proposal.wrong == ()
     description, robot, config = loaded(proposal)
     assert description.joints == own.joints
@@ -84,7 +84,7 @@ def test_legs_are_told_from_arms_and_what_is_of_no_leg_is_welded(tmp_path):
     assert set(found.weld) == {"waist", "shoulder"}
     assert found.model.body(found.trunk).name == "base"
     assert (found.knee, found.forwards) == (2, (True,))
-    proposal = propose(found.path)
+    proposal = propose_robot(found.path)
     assert proposal.wrong == ()
     _, robot, _ = loaded(proposal)
     assert robot.structure.contact == "line"
@@ -132,7 +132,7 @@ def meshes_only(folder):
 
 def test_soles_of_meshes_are_asked_for(monkeypatch, capsys, tmp_path):
     path, draft, out = (tmp_path / name for name in ("robot.xml", "draft.toml", "robot.toml"))
-    proposal = propose(meshes_only(tmp_path))
+    proposal = propose_robot(meshes_only(tmp_path))
     assert all(sole.guessed for sole in proposal.soles)
     (line,) = [line for line in proposal.wrong if "guessed" in line]
     assert line.startswith("no box, sphere, capsule or cylinder of body 'left_foot' collides")
@@ -152,7 +152,7 @@ def test_soles_of_meshes_are_asked_for(monkeypatch, capsys, tmp_path):
 def test_wrenches_act_in_the_middle_of_a_sole_with_a_short_heel(tmp_path):
     path = small(tmp_path).model
     path.write_text(path.read_text().replace('pos="0.01 0 -0.03"', 'pos="0.05 0 -0.03"'))
-    proposal = propose(path)
+    proposal = propose_robot(path)
     assert proposal.wrong == ()
     assert "point" not in proposal.table["feet"]["left"]
     _, robot, _ = loaded(proposal)
@@ -168,7 +168,7 @@ def test_a_sole_behind_the_ankle_is_told(tmp_path):
     path = small(tmp_path).model
     text = path.read_text().replace('pos="0.05 0 -0.03"', 'pos="-0.05 0 -0.03"')
     path.write_text(text.replace('pos="0.01 0 -0.03"', 'pos="-0.01 0 -0.03"'))
-    _, robot, _ = loaded(propose(path))
+    _, robot, _ = loaded(propose_robot(path))
     assert any("along -x" in line for line in remarks(robot))
 
 
@@ -180,7 +180,7 @@ def test_a_tilted_box_is_the_sole_and_is_level_standing(tmp_path):
     path.write_text(text.replace(box, f'{box} euler="0 0.2 0"'))
     for sole in find_soles(survey_file(path)):
         np.testing.assert_allclose(sole.axes[:, 2], [np.sin(0.2), 0.0, np.cos(0.2)], atol=1e-9)
-    proposal = propose(path)
+    proposal = propose_robot(path)
     assert proposal.wrong == ()
     angles = proposal.table["standing"]
     total = sum(angles[f"left_{joint}"] for joint in ("pitch", "knee", "ankle"))
@@ -192,7 +192,7 @@ def test_a_tilted_box_is_the_sole_and_is_level_standing(tmp_path):
 
 @pytest.fixture(scope="module")
 def humanoid():
-    proposal = propose(HUMANOID.with_name("humanoid.xml"))
+    proposal = propose_robot(HUMANOID.with_name("humanoid.xml"))
     return proposal, *loaded(proposal)
 
 

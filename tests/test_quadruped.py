@@ -36,6 +36,9 @@ from hector_jax.control.weights import (
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, Wrench
+from hector_jax.export.export import (
+    weights_schema,
+)
 from hector_jax.grfm.dataset import ACROSS, ALONG, make_dataset, partners, with_mirror
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.gated import fit_gated
@@ -46,14 +49,11 @@ from hector_jax.grfm.residual import init, with_statistics
 from hector_jax.grfm.training import TrainConfig, train
 from hector_jax.qp import active_set
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import verdicts
-from hector_jax.runs.export import (
-    weights_schema,
-)
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs, ideal
-from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
+from hector_jax.verdict import judging
 
 FILE = Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml"
 ROBOT = load_robot(FILE)
@@ -143,7 +143,7 @@ def test_a_gait_is_chosen_by_name(monkeypatch, capsys):
     walked = []
     with monkeypatch.context() as patch:
         pretend = lambda robot, *known: walked.append(walk_config(robot)) or pretend_walk()  # noqa: E731
-        patch.setattr(verdicts, "walk_rigid_body", pretend)
+        patch.setattr(judging, "walk_rigid_body", pretend)
         for name in ("own", "trot", "pace", "crawl"):
             assert call(monkeypatch, "walk", *flags, "--gait", name) == 0
     named = [gait_named(CONFIG.gait, name) for name in ("trot", "pace", "crawl")]
@@ -246,11 +246,9 @@ def test_point_feet_have_weights_of_forces_alone(tmp_path):
 def data():
     """Samples of two walks on the rigid body whose ground answers a little less than commanded."""
     config = RolloutConfig(walk=CONFIG, ticks=60, lead=10)
-    walk_ = jax.jit(partial(rollout, config, ROBOT))
-    walks = [
-        walk_(weights, named_command("s"), ANCHOR, last_command)
-        for weights in (nominal(ROBOT), expert(ROBOT))
-    ]
+    scenario = Scenario(ROBOT, named_command("s"), ANCHOR, last_command)
+    walk_ = jax.jit(partial(rollout, config, scenario))
+    walks = [walk_(weights) for weights in (nominal(ROBOT), expert(ROBOT))]
     walks = jax.tree.map(lambda *x: np.stack(x), *walks)
     rng = np.random.default_rng(0)
     push = lambda x: 0.9 * x + rng.normal(size=x.shape)  # noqa: E731

@@ -13,11 +13,11 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import no_samples
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import walks
-from hector_jax.runs.campaign import Campaign, box_of, weights_at
-from hector_jax.runs.walk_log import LogScore, log_of
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.walk_tuning import walks
+from hector_jax.walk_tuning.campaign import Campaign, box_of, weights_at
+from hector_jax.walk_tuning.walk_log import LogScore, log_of
 
 SIZE = 6
 GOAL = np.linspace(-1.0, 1.0, SIZE)
@@ -78,7 +78,7 @@ def test_differences_halve_a_step_that_raises_the_loss():
 def test_what_the_model_tells_is_of_its_search(robot, tmp_path, monkeypatch):
     config = TuneConfig(rollout=BRIEF)
     campaign = Campaign(tmp_path, config, robot, nominal(), {"short": AHEAD}, [hfs()])
-    monkeypatch.setattr(walks, "space_of", lambda pool, campaign: campaign.folder)
+    monkeypatch.setattr(walks, "campaign_space", lambda pool, campaign: campaign.folder)
 
     def folder():
         return race.read_model(None, campaign, searches=False).space

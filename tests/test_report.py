@@ -14,9 +14,9 @@ from hector_jax.core.environment import environment
 from hector_jax.report import report
 from hector_jax.report.report import Picture, print_table
 from hector_jax.report.run import tuning_section, write_report
-from hector_jax.runs.walks import Change
 from hector_jax.tuning.curvature import Determined, Direction
 from hector_jax.tuning.status import StepStatus, Stop
+from hector_jax.walk_tuning.walks import Change
 
 
 def _printed(verdict, **options):

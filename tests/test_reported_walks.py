@@ -26,10 +26,10 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, no_samples
 from hector_jax.core.tree_file import save_tree
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import campaign as campaigns
-from hector_jax.runs import reported_walks, walk_log, walks
 from hector_jax.search.few_walks import Proposal
 from hector_jax.tuning.loss import loss_of_robot
+from hector_jax.walk_tuning import campaign as campaigns
+from hector_jax.walk_tuning import reported_walks, walk_log, walks
 
 SECONDS = 0.1
 SPEEDS = {"ahead": (0.5, 0.0), "aside": (0.0, 0.5), "back": (-0.5, 0.0)}
@@ -506,8 +506,8 @@ def test_reports_are_those_of_a_robot_whose_file_weighs_its_loss_otherwise(walke
 
 def test_reports_outlive_the_code_and_packages_that_took_them(walked, monkeypatch):
     before, files = rows(walked), content(walked)
-    for module in ("cache", "walks"):
-        monkeypatch.setattr(f"hector_jax.runs.{module}.code_hash", lambda *_: "of other code")
+    for module in ("store.cache", "walk_tuning.walks"):
+        monkeypatch.setattr(f"hector_jax.{module}.code_hash", lambda *_: "of other code")
     monkeypatch.setattr("hector_jax.core.environment.version", lambda package: "99")
     for old, new in zip(before, rows(walked), strict=True):
         jax.tree.map(np.testing.assert_array_equal, old, new)
@@ -519,7 +519,7 @@ def test_points_follow_from_the_weights_where_the_code_places_them_otherwise(wal
     thrice = lambda one: units(one) * np.where(np.arange(len(units(one))) < 18, 1.0, 3.0)  # noqa: E731
     monkeypatch.setattr(campaigns, "_units", thrice)
     one = campaign(walked)
-    space = walks.space_of(HandsOver(), one)
+    space = walks.campaign_space(HandsOver(), one)
     for number, row in enumerate(rows(walked)):
         kept = load_weights(walks.weights_path(walked, number), one.robot)
         again = campaigns.weights_at(one, space, row.point)
@@ -570,7 +570,7 @@ def test_a_folder_of_another_format_says_how_to_begin_anew(folder, robot, capsys
 def test_the_point_of_weights_is_the_one_that_they_came_from(folder):
     next_walk(folder, ("ahead",))
     one = campaign(folder)
-    space = walks.space_of(HandsOver(), one)
+    space = walks.campaign_space(HandsOver(), one)
     for point in POINTS:
         weights = campaigns.weights_at(one, space, point)
         np.testing.assert_allclose(campaigns.point_of(one, space, weights), point, atol=1e-12)

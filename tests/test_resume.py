@@ -28,8 +28,8 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
 from hector_jax.core.tree_file import load_tree, save_tree
 from hector_jax.robot.model import load_robot
-from hector_jax.runs.cache import load_or_make
-from hector_jax.runs.setup import Setup
+from hector_jax.store.cache import load_or_make
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig, descend
 
 ROBOT, CONFIG, HERE = load_robot(), TuneConfig(iterations=14), Path(__file__).parent

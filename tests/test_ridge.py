@@ -12,7 +12,8 @@ from pretend import pretend_tuning
 
 from hector_jax.control.weights import nominal
 from hector_jax.core.inputs import InputError
-from hector_jax.runs import nets, tunings, verdicts
+from hector_jax.store import nets, tunings
+from hector_jax.verdict import judging
 
 
 def test_the_ridges_are_compared_by_the_mean_log_ratio(monkeypatch, tmp_path):
@@ -29,8 +30,8 @@ def test_the_ridges_are_compared_by_the_mean_log_ratio(monkeypatch, tmp_path):
 
     monkeypatch.setattr(ridge, "workers", lambda count: nullcontext())
     monkeypatch.setattr(nets, "load_or_train", lambda *_: SimpleNamespace(params=None))
-    monkeypatch.setattr(tunings, "tune", tune)
-    monkeypatch.setattr(verdicts, "judge", judge)
+    monkeypatch.setattr(tunings, "tune_all", tune)
+    monkeypatch.setattr(judging, "judge", judge)
     words = ["--ridges", "0.0", "0.01", "--plants", "2", "--out", str(tmp_path / "out")]
     monkeypatch.setattr(sys, "argv", ["ridge.py", *words])
     ridge.main()

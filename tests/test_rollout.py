@@ -26,7 +26,7 @@ from hector_jax.tuning.difftune import (
 )
 from hector_jax.tuning.evaluate import evaluate_jit, gradient_norms
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total, with_alphas
-from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.tuning.status import StepStatus
 
 LONG = RolloutConfig(ticks=400)
@@ -50,7 +50,8 @@ def anchor(robot):
 def long_walk(weights, name):
     """A walk of 4 s with named weights; several tests look at one."""
     robot = load_robot()
-    return walk(LONG, robot, weights(), named_command(name), standing_anchor(robot), PLAIN)
+    scenario = Scenario(robot, named_command(name), standing_anchor(robot), PLAIN)
+    return walk(LONG, scenario, weights())
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -68,10 +69,10 @@ def test_a_foot_lands_where_phi_says_and_a_dataset_reads_it_back(robot, anchor):
     def moved(shift, window):
         return last_command(window)._replace(touchdown_error=shift)
 
-    command = named_command("c")
+    effects = (jax.tree_util.Partial(moved, by) for by in (np.zeros((2, 3)), shift))
     planned, walked = (
-        walk(SHORT, robot, nominal(), command, anchor, jax.tree_util.Partial(moved, by))
-        for by in (np.zeros((2, 3)), shift)
+        walk(SHORT, Scenario(robot, named_command("c"), anchor, effect), nominal())
+        for effect in effects
     )
     lands = np.flatnonzero(np.diff(planned.contact[:, 1].astype(int)) == 1)[0] + 1
     yaw = planned.state.euler[lands - 2, 2]
@@ -118,7 +119,7 @@ def test_falling_is_seen_and_charged(robot, anchor):
     weak = vector_to_weights(
         weights_to_vector(nominal()).at[12:].set(1.0)
     )  # effort so dear that it sinks
-    trajectory = walk(LONG, robot, weak, named_command("straight"), anchor, PLAIN)
+    trajectory = walk(LONG, Scenario(robot, STRAIGHT, anchor, PLAIN), weak)
     assert trajectory.fallen[-1]
     fallen = float(trajectory.fallen.sum())
     assert losses(PAPER_LOSS, trajectory)["L_pos"] >= 10 * fallen * 0.5**2
@@ -129,10 +130,10 @@ def test_falling_is_seen_and_charged(robot, anchor):
 def test_starting_half_a_cycle_later_mirrors_the_walk(robot):
     mirror = jnp.array([1.0, -1.0, 1.0])
     half = RolloutConfig().walk.gait.cycle // 2
-    command, later = named_command("straight"), standing_anchor(robot, half)
+    later = standing_anchor(robot, half)
     # A robot that is its own mirror image: the products of inertia that yaw couples to vanish.
     one = long_walk(nominal, "straight")
-    other = walk(LONG, robot, nominal(), command, later, PLAIN)
+    other = walk(LONG, Scenario(robot, STRAIGHT, later, PLAIN), nominal())
     position, force = other.state.position * mirror, other.command.force[:, ::-1] * mirror
     np.testing.assert_allclose(one.state.position[:50], position[:50], atol=1e-9)
     np.testing.assert_allclose(one.command.force[:50], force[:50], atol=1e-6)
@@ -153,18 +154,18 @@ def random_weights(seed):
     return vector_to_weights(weights_to_vector(nominal()) * np.exp(draws))
 
 
-def loss_of(config, robot, weights, *model):
+def loss_of(config, scenario, weights):
     """The loss by the program that has the gradient too, so that no other one is compiled."""
-    return float(tune_step(config, robot, weights, *model).loss)
+    return float(tune_step(config, scenario, weights).loss)
 
 
-def differences(config, robot, weights, *model, step, directions):
+def differences(config, scenario, weights, *, step, directions):
     """Central differences of the loss along directions (n, 24) in log-weights."""
     theta, found = np.asarray(weights_to_vector(weights)), []
     for direction in step * directions:
         vectors = (jnp.asarray(theta * np.exp(side * direction)) for side in (1, -1))
         both = (vector_to_weights(v, weights)._replace(others=weights.others) for v in vectors)
-        up, down = (loss_of(config, robot, moved, *model) for moved in both)
+        up, down = (loss_of(config, scenario, moved) for moved in both)
         found.append((up - down) / (2 * step))
     return np.array(found)
 
@@ -185,28 +186,25 @@ OBLIQUE = np.linalg.qr(np.random.default_rng(0).normal(size=(24, 24)))[0][:5]
 
 def check_gradient(
     config,
-    robot,
+    scenario,
     weights,
-    command,
-    anchor,
-    effect,
     bar,
     directions=np.eye(24),  # noqa: B008
     case="",
 ):
-    tuning, model = TuneConfig(rollout=config), (command, anchor, effect)
-    evaluation = tune_step(tuning, robot, weights, *model)
+    tuning = TuneConfig(rollout=config)
+    evaluation = tune_step(tuning, scenario, weights)
     reverse = weights_to_vector(jax.tree.map(jnp.multiply, evaluation.gradient, weights))
     # Halving the step tells a change of the active set inside it from a wrong derivative.
     errors = []
     for step in (1e-5, 5e-6, 2.5e-6):
-        expected = differences(tuning, robot, weights, *model, step=step, directions=directions)
+        expected = differences(tuning, scenario, weights, step=step, directions=directions)
         errors.append(relative(directions @ reverse, expected))
         if errors[-1] <= bar:
             break
     print(f"error against differences {errors}", end=" ")
     assert errors[-1] <= bar, (case, errors)
-    trajectory, columns = propagate(config, robot, weights, command, anchor, effect)
+    trajectory, columns = propagate(config, scenario, weights)
     _, forward = sensitivity.gradient(PAPER_LOSS, trajectory, columns, weights)
     forward = weights_to_vector(jax.tree.map(jnp.multiply, forward, weights))
     print(f"forward against reverse {relative(forward, reverse):.1e}")
@@ -215,44 +213,42 @@ def check_gradient(
 
 def test_gradient_over_50_ticks_is_that_of_differences(robot, anchor):
     weights = random_weights(0)._replace(others=start().others)
-    check_gradient(SHORT, robot, weights, named_command("s"), anchor, PLAIN, 1e-6, OBLIQUE)
+    scenario = Scenario(robot, named_command("s"), anchor, PLAIN)
+    check_gradient(SHORT, scenario, weights, 1e-6, OBLIQUE)
 
 
 @pytest.fixture
-def cases(net):
+def cases(robot, anchor, net):
     """Random weights for each trajectory, with phi the identity and the net."""
     return [
-        ((name, said), random_weights(seed), named_command(name), effect)
+        (
+            (name, said),
+            random_weights(seed),
+            Scenario(robot, named_command(name), anchor, effect),
+        )
         for seed, name in enumerate(COMMANDS)
         for said, effect in (("plain", PLAIN), ("net", net))
     ]
 
 
 @pytest.mark.slow
-def test_gradient_over_50_ticks_is_that_of_differences_from_anywhere(robot, anchor, cases):
-    for case, weights, command, effect in cases:
-        check_gradient(SHORT, robot, weights, command, anchor, effect, 1e-6, case=case)
+def test_gradient_over_50_ticks_is_that_of_differences_from_anywhere(cases):
+    for case, weights, scenario in cases:
+        check_gradient(SHORT, scenario, weights, 1e-6, case=case)
 
 
 @pytest.mark.slow
-def test_gradient_over_400_ticks_is_that_of_differences(robot, anchor, cases):
-    for case, weights, command, effect in cases:
-        assert not walk(LONG, robot, weights, command, anchor, effect).fallen.any(), case
-        check_gradient(LONG, robot, weights, command, anchor, effect, 1e-4, case=case)
+def test_gradient_over_400_ticks_is_that_of_differences(cases):
+    for case, weights, scenario in cases:
+        assert not walk(LONG, scenario, weights).fallen.any(), case
+        check_gradient(LONG, scenario, weights, 1e-4, case=case)
 
 
 @pytest.mark.slow
 def test_a_walk_in_blocks_is_the_same_walk_with_the_same_gradient(robot, anchor):
-    command = named_command("s")
+    scenario = Scenario(robot, named_command("s"), anchor, PLAIN)
     whole, parts = (
-        tune_step(
-            TuneConfig(rollout=RolloutConfig(ticks=50, block=block)),
-            robot,
-            start(),
-            command,
-            anchor,
-            PLAIN,
-        )
+        tune_step(TuneConfig(rollout=RolloutConfig(ticks=50, block=block)), scenario, start())
         for block in (500, 23)  # the last block is padded
     )
     assert float(parts.loss) == pytest.approx(float(whole.loss), rel=1e-12)
@@ -262,12 +258,7 @@ def test_a_walk_in_blocks_is_the_same_walk_with_the_same_gradient(robot, anchor)
 
 def test_the_way_back_solves_no_qp_again(robot, anchor):
     lowered = jax.jit(tune_step, static_argnums=0).lower(
-        CONFIG,
-        robot,
-        start(),
-        named_command("s"),
-        anchor,
-        PLAIN,
+        CONFIG, Scenario(robot, named_command("s"), anchor, PLAIN), start()
     )
     functions = lowered.as_text().split("func.func")
     solving = [f for f in functions if "solve_normal" in f.splitlines()[0] and ".while" in f]
@@ -280,11 +271,11 @@ def test_a_block_has_at_least_one_tick():
 
 
 def test_new_weights_commands_and_effects_need_no_compilation(robot, anchor):
-    tune_step(CONFIG, robot, start(), named_command("s"), anchor, PLAIN)
+    tune_step(CONFIG, Scenario(robot, named_command("s"), anchor, PLAIN), start())
     before = evaluate_jit._cache_size()
     other = TuneConfig(rollout=SHORT, loss=with_alphas({"L_Eul": 1.0}), beta_q=0.1, iterations=20)
     weights = expert()._replace(others=start().others)
-    tune_step(other, robot, weights, named_command("c"), anchor, PLAIN)
+    tune_step(other, Scenario(robot, named_command("c"), anchor, PLAIN), weights)
     assert evaluate_jit._cache_size() == before
 
 
@@ -292,15 +283,19 @@ def test_new_weights_commands_and_effects_need_no_compilation(robot, anchor):
 
 
 @pytest.fixture(scope="module")
-def recursion(robot, anchor):
+def straight(robot, anchor):
+    return Scenario(robot, STRAIGHT, anchor, PLAIN)
+
+
+@pytest.fixture(scope="module")
+def recursion(straight):
     """The walk from there and its sensitivities."""
-    return propagate(SHORT, robot, start(), STRAIGHT, anchor, PLAIN)
+    return propagate(SHORT, straight, start())
 
 
-def test_gradient_norms_are_those_of_the_parts(robot, anchor, recursion):
+def test_gradient_norms_are_those_of_the_parts(straight, recursion):
     weights = start()
-    arguments = SHORT, robot, weights, STRAIGHT, anchor, PLAIN
-    norms = list(gradient_norms(*arguments, PAPER_LOSS).values())
+    norms = list(gradient_norms(SHORT, straight, weights, PAPER_LOSS).values())
 
     def gradient(euler, position):
         loss = with_alphas({"L_Eul": euler, "L_pos": position})
@@ -312,22 +307,22 @@ def test_gradient_norms_are_those_of_the_parts(robot, anchor, recursion):
     np.testing.assert_allclose(norms, 1e-6 * np.linalg.norm(expected, axis=1), rtol=1e-6)
 
 
-def test_the_loss_is_that_of_its_parts(robot, anchor):
-    found = tune_step(CONFIG, robot, start(), STRAIGHT, anchor, PLAIN)
+def test_the_loss_is_that_of_its_parts(straight):
+    found = tune_step(CONFIG, straight, start())
     expected = 1e5 * found.terms["L_Eul"] + 2e5 * found.terms["L_pos"] + found.terms["L_ctrl"]
     assert found.loss == pytest.approx(float(expected))
     assert step_status(CONFIG, found) == StepStatus.ACCEPTED
 
 
 def test_the_derivatives_by_other_numbers_are_those_of_differences_and_of_the_recursion(
-    robot, anchor, recursion
+    straight, recursion
 ):
-    found = tune_step(CONFIG, robot, start(), STRAIGHT, anchor, PLAIN)
+    found = tune_step(CONFIG, straight, start())
 
     def loss(name, shift):
         others = {**start().others, name: start().others[name] + shift}
         moved = start()._replace(others=others)
-        return float(tune_step(CONFIG, robot, moved, STRAIGHT, anchor, PLAIN).loss)
+        return float(tune_step(CONFIG, straight, moved).loss)
 
     for name in OTHERS:
         expected = (loss(name, 1e-6) - loss(name, -1e-6)) / 2e-6
@@ -339,10 +334,9 @@ def test_the_derivatives_by_other_numbers_are_those_of_differences_and_of_the_re
             forward.others[name], found.gradient.others[name], rtol=1e-8, atol=1e-9
         )
     forward = sensitivity.matrix(PAPER_LOSS, *recursion, start(), OTHERS)
-    model = robot, start(), STRAIGHT, anchor, PLAIN
-    matrix = gauss_newton_jit(SHORT, *model, PAPER_LOSS, others=OTHERS)
+    matrix = gauss_newton_jit(SHORT, straight, start(), PAPER_LOSS, others=OTHERS)
     np.testing.assert_allclose(forward, matrix, rtol=1e-8, atol=1e-9 * np.abs(matrix).max())
     config = replace(CONFIG, others=OTHERS, iterations=5, rule="relative")
-    result = tune(config, robot, nominal(), STRAIGHT, anchor, PLAIN)
+    result = tune(config, straight, nominal())
     assert result.loss < found.loss
     assert set(result.weights.others) == set(OTHERS)

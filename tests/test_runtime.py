@@ -16,12 +16,12 @@ from hector_jax.control.weights import nominal
 from hector_jax.core import runtime
 from hector_jax.core.numerics import without_our_flag, without_ynnpack
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import tunings
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.tunings import Problem
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk_many
 from hector_jax.sim.world import hfs
+from hector_jax.store import tunings
+from hector_jax.store.setup import Setup
+from hector_jax.store.tunings import Problem
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
 
@@ -94,7 +94,7 @@ def test_processes_load_the_programs_that_one_of_them_compiled(monkeypatch, tmp_
     with runtime.workers(2) as pool:
         setup = Setup(pool, config, robot)
         tunings.compile_programs(setup, nominal(), straight)
-        tunings.tune(setup, problems, tmp_path / "tunings", title="")
+        tunings.tune_all(setup, problems, tmp_path / "tunings", title="")
         weights = config.rollout.walk.with_others(nominal(), ["friction"])
         jobs = [Job(weights, command, hfs(), 0.1) for (command,), *_ in problems.values()]
         list(walk_many(pool, config.rollout.walk, robot, jobs))

@@ -8,7 +8,7 @@ import pytest
 
 from hector_jax.robot.model import load_robot
 from hector_jax.sim import sensing
-from hector_jax.sim.loop import effect_of
+from hector_jax.sim.loop import contact_effect
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import build_world, hfs, ideal, standing_qpos, truth
 
@@ -19,7 +19,7 @@ ROBOT = load_robot()
 def sensed(robot, row, raw, floor, foot_of_geom):
     reading, contacts = sensing.unpack_reading(row), sensing.contacts_of(raw, floor)
     ground = sensing.ground_of(contacts, floor, foot_of_geom, feet=2)
-    points, wrench = sensing.foot_points(robot, reading), effect_of(robot, row, ground)
+    points, wrench = sensing.foot_points(robot, reading), contact_effect(robot, row, ground)
     return sensing.base_state(robot, reading, jnp.zeros(())), wrench, points, ground.touches
 
 

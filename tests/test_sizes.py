@@ -14,9 +14,9 @@ from hector_jax.core.settings import from_table, to_table
 from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.robot.description import Description, PlantSizes, read_description
 from hector_jax.robot.model import load_robot
-from hector_jax.runs.tunings import tune_config
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import WORLDS, hfs, hfs_drawn, hfs_varied, ideal, named_world
+from hector_jax.store.tunings import tune_config
 from hector_jax.tuning.loss import PAPER_LOSS, losses
 
 SIZES = PlantSizes(joint_friction=3.0, joint_damping=2.0, push=5.0, trunk_com=1.5, payload=4.0)

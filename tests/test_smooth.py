@@ -21,10 +21,11 @@ from hector_jax.control.trajectories import command_of
 from hector_jax.control.weights import nominal
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
-from hector_jax.runs import choice, tunings
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.tunings import Tuned
+from hector_jax.store import tunings
+from hector_jax.store.setup import Setup
+from hector_jax.store.tunings import Tuned
 from hector_jax.tuning.loss import alphas, between_loss
+from hector_jax.verdict import choice
 
 
 def _tunings(monkeypatch, folder, flags, robot=ROBOT, config=CONFIG):
@@ -35,7 +36,7 @@ def _tunings(monkeypatch, folder, flags, robot=ROBOT, config=CONFIG):
         seen.update({name: (setup.config, start, problem) for name, problem in problems.items()})
         return dict.fromkeys(problems, Tuned(pretend_tuning(3, start), ""))
 
-    monkeypatch.setattr(tunings, "tune", tune)
+    monkeypatch.setattr(tunings, "tune_all", tune)
     setup, course = Setup(Executor(), config, robot), (command_of("straight"),)
     run = command._Run(setup, folder, flags, nominal(), course, SimpleNamespace(params=None))
     command._tune_sets(run)

@@ -19,7 +19,7 @@ from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.difftune import TuneConfig, tune, tune_step
-from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.rollout import RolloutConfig, Scenario
 
 ROOT = Path(__file__).parents[1]
 ROBOT = load_robot()
@@ -53,8 +53,8 @@ def test_nothing_is_compiled_after_the_first_iteration(work, rule):
         work.clear()
 
     for name, net in (("straight", nets[0]), ("s", nets[1])):
-        command = named_command(name)
-        tune(config, ROBOT, nominal(), command, ANCHOR, as_effect(net), on_iteration)
+        scenario = Scenario(ROBOT, named_command(name), ANCHOR, as_effect(net))
+        tune(config, scenario, nominal(), on_iteration)
         work.clear()
     assert [number for number, *_ in seen].count(0) == 2
     assert len(seen) >= 4
@@ -66,8 +66,9 @@ def test_nothing_is_compiled_after_the_first_iteration(work, rule):
 
 @pytest.mark.slow
 def test_a_step_whose_shape_was_evaluated_is_not_traced_again(work):
-    step = partial(tune_step, TuneConfig(rollout=RolloutConfig(ticks=10)), ROBOT)
-    inputs, trace = (nominal(), named_command("c"), ANCHOR, last_command), "jaxpr_trace_duration"
+    scenario = Scenario(ROBOT, named_command("c"), ANCHOR, last_command)
+    step = partial(tune_step, TuneConfig(rollout=RolloutConfig(ticks=10)))
+    inputs, trace = (scenario, nominal()), "jaxpr_trace_duration"
     jax.eval_shape(step, *inputs)
     assert work[f"/jax/core/compile/{trace}"] > 0
     work.clear()
@@ -95,8 +96,8 @@ def test_memory_arrays_and_open_files_stay_flat_over_500_iterations():
         if iteration.iteration % 100 == 0:
             after[int(iteration.iteration)] = held()
 
-    command = named_command("c")
-    found = tune(config, ROBOT, nominal(), command, ANCHOR, last_command, on_iteration)
+    scenario = Scenario(ROBOT, named_command("c"), ANCHOR, last_command)
+    found = tune(config, scenario, nominal(), on_iteration)
     assert len(found.iterations) == 501
     print({number: f"{memory / 2**20:.1f} MiB" for number, (memory, _) in after.items()})
     assert after[500][0] <= 1.05 * after[100][0]

@@ -11,8 +11,8 @@ from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert
 from hector_jax.robot.description import MODEL_PATH, Description, Foot, read_description
-from hector_jax.robot.importer.source import build_spec
 from hector_jax.robot.model import load_robot, robot_of
+from hector_jax.robot.source import build_spec
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import ideal

@@ -155,7 +155,7 @@ def test_a_load_accelerates_the_centre_of_mass_and_turns_the_body_about_it(robot
 def test_what_a_wrench_leaves_unexplained_is_the_load(robot, seed):
     state, wrench, dt = some_state(seed), some_wrench(seed), 1e-4
     load = Load(jnp.array([3.0, -2.0, 1.0]), jnp.array([0.4, 0.2, -0.3]))
-    after = srbm.step(robot, state, wrench, FEET, dt, load)
-    found = srbm.unexplained(robot, state, after, wrench, FEET, dt)
+    after = srbm.step(robot, state, wrench, FEET, dt, load=load)
+    found = srbm.unexplained(robot, state, after, wrench, FEET, dt=dt)
     np.testing.assert_allclose(found.force, load.force, atol=1e-6)
     np.testing.assert_allclose(found.torque, load.torque, atol=1e-3)

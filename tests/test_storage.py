@@ -299,7 +299,7 @@ def edited(tmp_path, monkeypatch):
         ("control.footstep", "    points = (", "    # a comment\n    points = (", True),
         ("control.footstep", "Next touchdown of each foot", "Another docstring", True),
         ("core.console", "_QUIET = 15.0", "_QUIET = 16.0", True),
-        ("runs.export", "TOLERANCE = 1e-6", "TOLERANCE = 1e-7", True),
+        ("export.export", "TOLERANCE = 1e-6", "TOLERANCE = 1e-7", True),
     ],
 )
 def test_a_result_holds_for_the_code_that_computes_it(edited, module, before, after, same):

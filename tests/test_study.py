@@ -20,12 +20,14 @@ from hector_jax.control.weights_file import save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.report.video import VideoUnavailable
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import nets, searches, tunings, verdicts
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.tunings import Tuned
 from hector_jax.search.cmaes import Generation, SearchResult
 from hector_jax.sim.world import hfs
+from hector_jax.store import nets, tunings
+from hector_jax.store.setup import Setup
+from hector_jax.store.tunings import Tuned
 from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.verdict import judging
+from hector_jax.walk_tuning import searches
 
 
 def plants(seeds):
@@ -63,10 +65,10 @@ def asked(monkeypatch):
         params = None
 
     monkeypatch.setattr(nets, "load_or_train", lambda *args: Net)
-    monkeypatch.setattr(searches, "search", search)
+    monkeypatch.setattr(searches, "search_all", search)
     monkeypatch.setattr(tunings, "_tunings", side_by_side)
     monkeypatch.setattr(table_steps, "tune_along_walks", tune_along_walks)
-    monkeypatch.setattr(verdicts, "walk_jobs", walks_of)
+    monkeypatch.setattr(judging, "walk_jobs", walks_of)
     monkeypatch.setattr(table_plots, "write_strip", write_strip)
     return told
 

@@ -15,7 +15,7 @@ from hector_jax.grfm.gated import fit_gated
 from hector_jax.grfm.nets import NO_EPOCHS
 from hector_jax.grfm.network import VARIANTS, as_effect, load_net, save_net
 from hector_jax.grfm.paper import fit_linear
-from hector_jax.grfm.training import TrainConfig, errors, report, train
+from hector_jax.grfm.training import TrainConfig, errors, errors_by_phi, train
 from hector_jax.robot.model import load_robot
 
 
@@ -56,7 +56,7 @@ def residual(parts):
 
 def test_the_net_beats_the_raw_command_and_the_linear_map_on_walks_it_never_saw(parts, trained):
     held_out = parts[1]
-    told = report(
+    told = errors_by_phi(
         {
             "raw": last_command,
             "linear": as_effect(fit_linear(parts[0])),
@@ -72,7 +72,7 @@ def test_the_net_beats_the_raw_command_and_the_linear_map_on_walks_it_never_saw(
 
 def test_the_residual_net_beats_its_linear_part_on_walks_it_never_saw(parts, residual, gated):
     params, history = residual
-    told = report(
+    told = errors_by_phi(
         {
             "raw": last_command,
             "gated": as_effect(gated),

@@ -22,15 +22,18 @@ from hector_jax.tuning.evaluate import evaluate_jit, gradient_norms
 from hector_jax.tuning.loss import PAPER_LOSS
 from hector_jax.tuning.rollout import (
     RolloutConfig,
-    _estimate_error,
-    _moved_by,
-    _within_friction,
-    drawn_variation,
+    Scenario,
     rollout,
     rollout_config,
-    variation_of,
+    with_variation,
 )
-from hector_jax.tuning.rollout import no_variation as as_believed
+from hector_jax.tuning.variation import (
+    drawn_variation,
+    estimate_error,
+    moved_by,
+    within_friction,
+)
+from hector_jax.tuning.variation import no_variation as as_believed
 
 ROBOT = load_robot()
 FEET = jnp.array([[0.02, 0.08, 0.0], [-0.01, -0.08, 0.0]])
@@ -62,7 +65,8 @@ def assert_same(one, other):
 def moved(variation, now, before=None, feet_before=FEET):
     before = now if before is None else before
     now, before = ground_effect(now), ground_effect(before)
-    return _moved_by(variation, ROBOT, tilted(), now, FEET, before, feet_before, DT)
+    before = before, feet_before
+    return moved_by(variation, ROBOT, tilted(), dt=DT, now=(now, FEET), before=before)
 
 
 def test_without_a_variation_the_body_moves_as_the_rigid_body():
@@ -91,16 +95,16 @@ def test_a_force_through_the_true_centre_of_mass_does_not_turn_the_body():
     up = Wrench(jnp.zeros((2, 3)).at[0, 2].set(50.0), jnp.zeros((2, 3)))
     under = jnp.array([[0.01, -0.02, -0.4]] * 2)
     variation = no_variation()._replace(com=offset)
-    now = ground_effect(up)
-    found = _moved_by(variation, ROBOT, state, now, under, now, under, DT)
+    now = ground_effect(up), under
+    found = moved_by(variation, ROBOT, state, dt=DT, now=now, before=now)
     np.testing.assert_allclose(found.ang_velocity, 0.0, atol=1e-12)
-    beside = _moved_by(no_variation(), ROBOT, state, now, under, now, under, DT)
+    beside = moved_by(no_variation(), ROBOT, state, dt=DT, now=now, before=now)
     assert np.abs(beside.ang_velocity).max() > 1e-3
 
 
 def test_a_foot_that_slips_keeps_its_direction_and_load():
     force = jnp.array([[30.0, -20.0, 50.0], [15.0, 8.0, 50.0]])
-    found = _within_friction(Wrench(force, force), jnp.asarray(0.5)).force
+    found = within_friction(Wrench(force, force), jnp.asarray(0.5)).force
     # twice the limit keeps half of it, 23 of 25 N nearly all: the edge is smooth
     share = (1.0 + np.array([2.0, 23.0 / 25.0]) ** 8) ** (-1 / 8)
     np.testing.assert_allclose(found[:, :2], share[:, None] * force[:, :2])
@@ -109,7 +113,7 @@ def test_a_foot_that_slips_keeps_its_direction_and_load():
 
 
 def test_drawn_variations_are_as_robots_differ():
-    config = RolloutConfig()
+    config = RolloutConfig().walk
     drawn = [drawn_variation(config, ROBOT, seed) for seed in range(200)]
     for name, low, high in (
         ("mass", 0.9, 1.1),
@@ -130,7 +134,7 @@ def test_drawn_variations_are_as_robots_differ():
 def test_the_error_of_the_estimate_has_its_stated_sizes():
     sizes = State(*(jnp.asarray(rows) for rows in np.linspace(0.01, 0.12, 12).reshape(4, 3)))
     noisy = no_variation()._replace(noise=sizes)
-    draw = jax.jit(jax.vmap(lambda tick: _estimate_error(noisy, tilted(), tick)))
+    draw = jax.jit(jax.vmap(lambda tick: estimate_error(noisy, tilted(), tick)))
     for found, size in zip(draw(jnp.arange(2000)), sizes, strict=True):
         np.testing.assert_allclose(found.std(axis=0), size, rtol=0.1)
         assert (np.abs(found.mean(axis=0)) < 0.1 * size).all()
@@ -138,20 +142,24 @@ def test_the_error_of_the_estimate_has_its_stated_sizes():
 
 def test_friction_has_a_slope_where_no_foot_carries_anything():
     none = Wrench(jnp.zeros((2, 3)), jnp.zeros((2, 3)))
-    slope = jax.grad(lambda f: _within_friction(none, f).force.sum())(0.5)
+    slope = jax.grad(lambda f: within_friction(none, f).force.sum())(0.5)
     assert np.isfinite(slope)
 
 
 @pytest.mark.slow  # compiles two rollouts
 def test_a_walk_in_a_world_that_is_as_believed_is_the_plain_one():
     config, anchor = RolloutConfig(ticks=40), standing_anchor(ROBOT)
-    arguments = config, ROBOT, nominal(), named_command("s"), anchor, last_command
-    plain, same = walk(*arguments), walk(*arguments, no_variation())
+    scenario = Scenario(ROBOT, named_command("s"), anchor, last_command)
+    plain, same = (
+        walk(config, scenario._replace(variation=variation), nominal())
+        for variation in (None, no_variation())
+    )
     np.testing.assert_allclose(same.state.position, plain.state.position, atol=1e-9)
     noise = State(*(jnp.full(3, 5e-3) for _ in range(4)))
     noisy = [
-        walk(*arguments, no_variation()._replace(noise=noise, seed=jnp.asarray(seed)))
+        walk(config, scenario._replace(variation=variation), nominal())
         for seed in (1, 1, 2)
+        for variation in [no_variation()._replace(noise=noise, seed=jnp.asarray(seed))]
     ]
     np.testing.assert_array_equal(noisy[0].state.position, noisy[1].state.position)
     apart = [np.abs(w.state.position - plain.state.position).max() for w in noisy[1:]]
@@ -165,8 +173,10 @@ def robot_with(**settings):
 
 
 def test_the_description_of_a_robot_states_the_noise_and_the_delay_of_its_tunings():
-    assert variation_of(rollout_config(ROBOT)) is None
-    variation = variation_of(rollout_config(robot_with(estimate_noise=2.0, delay=0.005)))
+    scenario = Scenario(ROBOT, named_command("s"), standing_anchor(ROBOT), last_command)
+    assert with_variation(rollout_config(ROBOT), scenario).variation is None
+    config = rollout_config(robot_with(estimate_noise=2.0, delay=0.005))
+    variation = with_variation(config, scenario).variation
     np.testing.assert_allclose(variation.noise.velocity, 0.04)
     np.testing.assert_allclose(variation.noise.euler, 0.002)
     assert_same(variation._replace(noise=as_believed().noise, delay=0.0), as_believed())
@@ -183,18 +193,17 @@ def test_a_delay_of_more_than_a_tick_is_refused():
 def test_a_tuning_sees_the_noise_and_the_delay_of_the_description():
     robot = robot_with(estimate_noise=1.0, delay=0.005)
     config = rollout_config(robot, ticks=10)
-    inputs = nominal(), named_command("straight"), standing_anchor(ROBOT), last_command
-    seen = tune_step(TuneConfig(rollout=config), robot, *inputs)
-    expected = evaluate_jit(
-        RolloutConfig(ticks=10), robot, *inputs, PAPER_LOSS, variation_of(config)
-    )
-    assert_same(seen, expected)
-    plain = evaluate_jit(config, robot, *inputs, PAPER_LOSS, no_variation())
+    scenario = Scenario(robot, named_command("straight"), standing_anchor(ROBOT), last_command)
+    seen = tune_step(TuneConfig(rollout=config), scenario, nominal())
+    told = with_variation(config, scenario)
+    assert_same(seen, evaluate_jit(RolloutConfig(ticks=10), told, nominal(), PAPER_LOSS))
+    none = scenario._replace(variation=no_variation())
+    plain = evaluate_jit(config, none, nominal(), PAPER_LOSS)
     assert abs(seen.loss / plain.loss - 1.0) > 1e-3
     single = tuple(t._replace(weight=float(t.name == "L_ctrl")) for t in PAPER_LOSS)
-    slope = evaluate_jit(config, robot, *inputs, single).gradient
+    slope = evaluate_jit(config, scenario, nominal(), single).gradient
     logs = weights_to_vector(jax.tree.map(jnp.multiply, slope, nominal()))
-    norms = gradient_norms(config, robot, *inputs, PAPER_LOSS)
+    norms = gradient_norms(config, scenario, nominal(), PAPER_LOSS)
     assert norms["L_ctrl"] == pytest.approx(np.linalg.norm(logs))
 
 
@@ -203,9 +212,13 @@ def test_the_curvature_of_a_tuning_has_its_noise():
     robot = robot_with(estimate_noise=1.0, delay=0.005)
     config = rollout_config(robot, ticks=10)
     effect = effect_of(None, config.walk)
-    model = nominal(), named_command("straight"), standing_anchor(robot), effect, PAPER_LOSS
-    seen = gauss_newton_jit(config, robot, *model)
-    expected = gauss_newton_jit(RolloutConfig(ticks=10), robot, *model, variation_of(config))
-    plain = gauss_newton_jit(config, robot, *model, no_variation())
+    scenario = Scenario(robot, named_command("straight"), standing_anchor(robot), effect)
+
+    def matrix(config, variation=None):
+        varied = scenario._replace(variation=variation)
+        return gauss_newton_jit(config, varied, nominal(), PAPER_LOSS)
+
+    seen, plain = matrix(config), matrix(config, no_variation())
+    expected = matrix(RolloutConfig(ticks=10), with_variation(config, scenario).variation)
     np.testing.assert_allclose(seen, expected, rtol=1e-9)
     assert np.abs(seen / plain - 1.0).max() > 1e-3

@@ -20,14 +20,14 @@ from hector_jax.report import matrix as report
 from hector_jax.report import plots
 from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import matrix, verdicts
-from hector_jax.runs.matrix import Column
-from hector_jax.runs.metrics import family_of, make_verdict
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.tunings import tune_config
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.standin import FAMILIES, even, standin
+from hector_jax.store.setup import Setup
+from hector_jax.store.tunings import tune_config
 from hector_jax.tuning.loss import PAPER_LOSS
+from hector_jax.verdict import judging, matrix
+from hector_jax.verdict.matrix import Column
+from hector_jax.verdict.metrics import family_of, make_verdict
 
 C, DRAKE, HEAVY = Column("c", "own"), Column("drake", "own"), Column("c", "heavy")
 SETS = ("nominal", "expert", "with")
@@ -229,7 +229,7 @@ def walked(monkeypatch):
             yield pretend_walk(job.seed, float(job.weights.Q.euler[0]) / 1e4, 1.0)
 
     other = MUJOCO_C._replace(name="drake", title="Drake")
-    monkeypatch.setattr(verdicts, "walk_jobs", walks_of)
+    monkeypatch.setattr(judging, "walk_jobs", walks_of)
     monkeypatch.setattr(
         command,
         "choose_engine",
@@ -337,9 +337,11 @@ def test_wrong_input_is_one_line_before_anything_is_walked(
 def test_walks_of_models_and_trajectories_with_hyphens_are_told_apart():
     walks = {name: (NamedCommand(name, named_command("s")), 1.0) for name in ("y-z", "z")}
     sets = {name: {"nominal": nominal()} for name in walks}
-    models = {"x": command.Model(), "x-y": command.Model(mass=1.1)}
+    models = {"x": command.PlantModel(), "x-y": command.PlantModel(mass=1.1)}
     columns = {Column("c", model): range(1) for model in models}
-    plan = command.Plan(load_robot(), "standin", walks, sets, models, columns, {"c": MUJOCO_C})
+    plan = command.VerdictPlan(
+        load_robot(), "standin", walks, sets, models, columns, {"c": MUJOCO_C}
+    )
     assert len(command._jobs(plan, "c")) == 4
 
 

@@ -25,8 +25,8 @@ from hector_jax.report import pictures, view
 from hector_jax.report.motion import motion
 from hector_jax.report.view import ViewedWalk, arrows
 from hector_jax.robot.model import compile_model, describe, load_robot
-from hector_jax.runs import folder as runs
-from hector_jax.runs.cache import robot_hash
+from hector_jax.store import folder as runs
+from hector_jax.store.cache import robot_hash
 
 
 @pytest.fixture(scope="module")

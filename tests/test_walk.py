@@ -165,7 +165,7 @@ def test_from_a_fall_on_the_sample_before_it_is_repeated(monkeypatch, after):
     state = State(*(at[:, None] * np.ones(3) for _ in range(4)))
     sample = Sample(state, state, Wrench(zero, zero), zero, at, at >= fell, at >= fell)
     plan = Plan(Wrench(zero, zero), zero, None, None, zero, None)
-    monkeypatch.setattr(walks, "_walk_blocks", lambda *_: iter([(plan, sample)]))
+    monkeypatch.setattr(walks, "_walk_blocks", lambda *_, **__: iter([(plan, sample)]))
     sound = SimpleNamespace(broken=False)
     job = Job(expert(), named_command("straight"), ideal(), seconds=0.05)
     walked = walk(CONFIG, ROBOT, job, build=lambda *_: sound)

@@ -25,16 +25,16 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import save_tree
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import campaign as campaigns
-from hector_jax.runs import reported_walks, walk_log, walks
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.tunings import Tuned
 from hector_jax.sim.engine import ENGINES, MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
+from hector_jax.store.setup import Setup
+from hector_jax.store.tunings import Tuned
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import loss_of
+from hector_jax.walk_tuning import campaign as campaigns
+from hector_jax.walk_tuning import reported_walks, walk_log, walks
 
 # all walks of this file are of these ticks and this command: one set of programs for all tests
 CONFIG, COMMAND, SECONDS = TuneConfig(rollout=BRIEF), {"short": AHEAD}, 0.05
@@ -77,7 +77,7 @@ def campaign(folder, robot, plants=(None,), seed=0):
 def in_process(robot, pool, tmp_path_factory):
     one = campaign(tmp_path_factory.mktemp("walked"), robot, [hfs()])
     rows = walks.tune_on_walks(pool, one, WALKS)
-    return one, walks.answer(one, walks.space_of(pool, one), rows)[0], rows
+    return one, walks.answer(one, walks.campaign_space(pool, one), rows)[0], rows
 
 
 def walked(robot, weights, path):
@@ -90,7 +90,7 @@ def test_eight_walks_through_files_equal_eight_in_process_to_the_last_bit(
     robot, pool, in_process, tmp_path
 ):
     one, (_, _, rows) = campaign(tmp_path, robot), in_process
-    space, again = walks.space_of(pool, one), []
+    space, again = walks.campaign_space(pool, one), []
     for number in range(WALKS):
         again = reported_walks.read_reports(pool, one)  # as a new process would
         proposal, weights = walks.next_proposal(pool, one, space, again)
@@ -109,7 +109,7 @@ def test_what_was_walked_is_not_walked_again(monkeypatch, pool, in_process):
     one, weights, _ = in_process
     monkeypatch.setattr(walks, "walk_case", None)
     again = walks.tune_on_walks(pool, one, WALKS)
-    weights_again, _ = walks.answer(one, walks.space_of(pool, one), again)
+    weights_again, _ = walks.answer(one, walks.campaign_space(pool, one), again)
     np.testing.assert_array_equal(weights_again.Q.euler, weights.Q.euler)
 
 
@@ -148,7 +148,9 @@ def test_an_engine_of_walks_that_is_not_installed_is_refused_before_any_tuning(m
 def test_the_plain_model_is_not_grounded(robot, pool, in_process):
     one, _, rows = in_process
     losses = [
-        walks._model(pool, replace(one, grounded=grounded), walks.space_of(pool, one), rows[:1])
+        walks._model(
+            pool, replace(one, grounded=grounded), walks.campaign_space(pool, one), rows[:1]
+        )
         for grounded in (True, False)
     ]
     point = rows[1].point
@@ -163,7 +165,7 @@ def test_the_record_of_another_tuning_is_refused(robot, in_process):
 
 
 def test_a_start_that_falls_is_refused(robot, pool, in_process, tmp_path):
-    one, space = campaign(tmp_path, robot), walks.space_of(pool, in_process[0])
+    one, space = campaign(tmp_path, robot), walks.campaign_space(pool, in_process[0])
     row = walks.Row(np.zeros(19), "start", None, np.array([np.inf]), 1.0)
     with pytest.raises(InputError, match="the start fell"):
         walks.next_proposal(pool, one, space, [row])
@@ -174,7 +176,7 @@ def with_legs(robot, pool, tmp_path):
     config = replace(CONFIG, others=("turn_lead",))
     one = replace(campaign(tmp_path, robot), config=config, leg_numbers=("foot_height", "kp"))
     save_tree(tmp_path / "metric.npz", {"matrix": np.eye(19)}, kind="metric", robot=robot)
-    return one, walks.space_of(pool, one)
+    return one, walks.campaign_space(pool, one)
 
 
 def test_numbers_of_the_legs_are_coordinates_of_their_own_within_their_boxes(with_legs):
@@ -304,7 +306,7 @@ def test_a_start_that_falls_is_walked_once_and_kept(monkeypatch, robot, pool, in
     (tmp_path / "metric.npz").write_bytes((in_process[0].folder / "metric.npz").read_bytes())
     monkeypatch.setattr(walks, "walk_case", _fell)
     rows = walks.tune_on_walks(pool, one, WALKS)
-    assert [change.change for change in walks.changes(rows)] == [None]
+    assert [change.change for change in walks.changes_by_walk(rows)] == [None]
     sets = walks.candidates(pool, one, rows)
     assert list(sets) == ["set 0"]
     np.testing.assert_allclose(sets["set 0"].Q.euler, nominal(robot).Q.euler, rtol=1e-12)
@@ -325,8 +327,8 @@ def test_the_sets_to_choose_from_are_the_start_each_gain_and_the_answer(pool, in
 def test_the_points_of_a_folder_stay_in_one_metric(monkeypatch, pool, in_process):
     """Where another release computes another matrix, the walks are still of their weights."""
     one, _, rows = in_process
-    monkeypatch.setattr(walks.tunings, "gauss_newton", None)
-    space = walks.space_of(pool, one)
+    monkeypatch.setattr(walks.tunings, "relative_matrix", None)
+    space = walks.campaign_space(pool, one)
     again = campaigns.weights_at(one, space, rows[-1].point)
     kept = load_weights(walks.weights_path(one.folder, len(rows) - 1), one.robot)
     jax.tree.map(np.testing.assert_array_equal, again, kept)
@@ -370,7 +372,7 @@ def test_a_run_spends_the_walks_that_were_asked_for(monkeypatch, robot, tmp_path
         return [row]
 
     monkeypatch.setattr(
-        command.tunings, "tune", lambda _, problems, **__: dict.fromkeys(problems, there)
+        command.tunings, "tune_all", lambda _, problems, **__: dict.fromkeys(problems, there)
     )
     monkeypatch.setattr(command, "tune_on_walks", on_walks)
     monkeypatch.setattr(command, "choose_engine", ENGINES.get)  # installed or not
@@ -387,6 +389,6 @@ def test_a_run_spends_the_walks_that_were_asked_for(monkeypatch, robot, tmp_path
     assert seen == {"plants": 3, "commands": ["straight"], "count": 12, "engine": "drake"}
     np.testing.assert_array_equal(tuned.sets["best"].Q.euler, expert().Q.euler)
     assert (tmp_path / "weights" / "before_walks.json").exists()
-    assert walks.changes(tuned.proposals)[0].change == 0.0
+    assert walks.changes_by_walk(tuned.proposals)[0].change == 0.0
     with pytest.raises(InputError, match=r"--walks must be 0 or at least 6 .*, got 5"):
         run_folder.trajectories(Tune(walks=5, walk_plants=3), robot)

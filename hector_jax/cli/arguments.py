@@ -25,15 +25,15 @@ from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree_file import ROBOT_DIGITS, read_card, tree_hash
 from hector_jax.robot.description import Description
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import verdicts
-from hector_jax.runs.cache import robot_hash
-from hector_jax.runs.folder import RunRequest
-from hector_jax.runs.metrics import family_of
 from hector_jax.sim.engine import MUJOCO_C, Engine
 from hector_jax.sim.loop import Job, check_plant
 from hector_jax.sim.standin import FAMILIES
 from hector_jax.sim.world import Imperfections, named_world
+from hector_jax.store.cache import robot_hash
+from hector_jax.store.folder import RunRequest
 from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.verdict import judging
+from hector_jax.verdict.metrics import family_of
 
 
 def weights(text: str, robot: Robot) -> Weights:
@@ -244,13 +244,14 @@ def walk_once(
     robot: Robot,
     trajectory: NamedCommand,
     weights: Weights,
-    plant: Robot | None,
+    *,
+    plant: Robot | None = None,
     engine: Engine = MUJOCO_C,
 ) -> Trajectory:
     """Walk once in the world of the flags; `plant` is another model of the robot."""
     if args.world == "srbm":
         seconds = walk_seconds(args, trajectory)
-        return verdicts.walk_rigid_body(robot, weights, trajectory.command, seconds)
+        return judging.walk_rigid_body(robot, weights, trajectory.command, seconds)
     job = job_of(args, robot, trajectory, weights, plant)
     return next(engine.walk(None, walk_config(robot), robot, [job]))
 

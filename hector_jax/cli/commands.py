@@ -18,20 +18,22 @@ from hector_jax.core.files import locked, make_folder, write_file, write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
 from hector_jax.core.settings import as_toml
+from hector_jax.export import export
 from hector_jax.grfm.training import TrainConfig
+from hector_jax.importing.propose import RobotProposal, standard_form
+from hector_jax.importing.propose import propose_robot as propose_robot
+from hector_jax.importing.remarks import differences, remarks
+from hector_jax.importing.table import changes_of_model, section, table_of
 from hector_jax.report.compare import compare_runs, print_comparison
-from hector_jax.robot.importer.propose import Proposal, standard_form
-from hector_jax.robot.importer.propose import propose as propose_robot
-from hector_jax.robot.importer.remarks import differences, remarks
-from hector_jax.robot.importer.table import changes, section, table_of
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import export, nets, searches, tunings
-from hector_jax.runs.folder import RESULT, load_run, read_request
-from hector_jax.runs.setup import Setup
 from hector_jax.search.cmaes import SearchConfig
 from hector_jax.sim import margin
 from hector_jax.sim.engine import choose_engine
+from hector_jax.store import nets, tunings
+from hector_jax.store.folder import RESULT, load_run, read_request
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.loss import alphas, loss_of_robot
+from hector_jax.walk_tuning import searches
 
 
 @singledispatch
@@ -57,7 +59,7 @@ def collect(args: flags.Collect) -> None:
     robot = load_robot(args.robot)
     out = arguments.flag_folder(args, "out", robot)
     with workers(args.processes) as pool:
-        nets.collect(pool, config, robot, out)
+        nets.collect_walks(pool, config, robot, out)
     say(f"the walks are in {out}")
 
 
@@ -68,7 +70,7 @@ def train(args: flags.Train) -> None:
     robot = load_robot(args.robot)
     data = arguments.flag_folder(args, "data", robot)
     path = args.out or nets.net_path(data.parent, args.variant)
-    errors = nets.train(config, robot, data, path).errors
+    errors = nets.train_net(config, robot, data, path).errors
     result = {"net": str(path), "errors": errors}
     print_result(args.json, result, partial(arguments.print_errors, errors))
     say(f"the net is in {path}")
@@ -89,7 +91,7 @@ def search(args: flags.Search) -> None:
     shared: dict[str, Any] = {"commands": commands, "engine": engine}
     with workers(args.processes) as pool:
         setup = Setup(pool, tuning, robot)
-        results = searches.search(setup, config, start, folder=args.record or out, **shared)
+        results = searches.search_all(setup, config, start, folder=args.record or out, **shared)
         say("walking with the start, expert and best weights")
         sets = {name: [start, expert(robot), result.weights] for name, result in results.items()}
         at_once = config.population * len(commands)
@@ -160,17 +162,17 @@ def examine_robot(args: flags.Robot) -> None:
         if proposal.error is None:
             try:
                 loss_of_robot(robot.description)
-                inputs = robot, walk_config(robot), nominal(robot)
-                lines += section("delay", margin.delay_lines(*inputs))
+                told_delay = margin.delay_lines(robot, walk_config(robot), nominal(robot))
+                lines += section("delay", told_delay)
             except InputError as error:  # a setting that controller or loss refuse
                 wrong.append(str(error))
-        lines += section("mended", changes(robot))
+        lines += section("mended", changes_of_model(robot))
     if file.suffix == ".toml" and proposal.filled:
         lines += section(
             "left out", [f"{', '.join(proposal.filled)}: HECTOR's, below by the rules"]
         )
     print("\n".join([*lines, *section("wrong", [*told, *wrong])]))
-    head = f"Proposed by `hector robot {file.name}`; rules: docs/howto/robot.md."
+    head = f"Proposed by `hector robot {file.name}`; rules: docs/robot-toml.md."
     comments = [head, *(f"To be mended: {line}" for line in [*told, *wrong] if wrong)]
     if out is not None:
         _write_robot(out, proposal, comments, file)
@@ -184,7 +186,7 @@ def examine_robot(args: flags.Robot) -> None:
         raise InputError("; ".join([*unlike, wrong[-1]]))
 
 
-def _write_robot(out: Path, proposal: Proposal, comments: Sequence[str], file: Path) -> None:
+def _write_robot(out: Path, proposal: RobotProposal, comments: Sequence[str], file: Path) -> None:
     """Write a robot in the standard form, or a draft beside a copy of the model that it names."""
     table, name = proposal.table, str(proposal.table["model"])
     source, model = file.with_name(name), out.with_name(name)

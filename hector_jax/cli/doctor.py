@@ -24,11 +24,11 @@ from hector_jax.report.motion import motions
 from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film
 from hector_jax.robot.description import MODEL_PATH
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs.verdicts import walk_rigid_body
 from hector_jax.sim.engine import ENGINES, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import named_world
+from hector_jax.verdict.judging import walk_rigid_body
 
 _EXTRAS = {  # name: (packages that it needs, what needs it)
     "export": (("flatbuffers",), "hector export"),

@@ -30,14 +30,15 @@ from hector_jax.report import fidelity, pictures
 from hector_jax.report.report import print_table
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import metrics, nets, tunings, verdicts
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.walk_log import walk_card
 from hector_jax.sim.diagnosis import Fall, fall_of
 from hector_jax.sim.engine import MUJOCO_C, choose_engine
 from hector_jax.sim.loop import Job
+from hector_jax.store import nets, tunings
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import Loss, loss_of_robot
+from hector_jax.verdict import judging, metrics
+from hector_jax.walk_tuning.walk_log import walk_card
 
 
 def evaluate(args: Evaluate) -> None:
@@ -59,11 +60,20 @@ def evaluate(args: Evaluate) -> None:
     config, engine = tunings.tune_config(robot), choose_engine(args.engine)
     with workers(args.processes) as pool:
         title = f"evaluating on {plural(count, 'plant')} of {args.world}"
-        inputs = Setup(pool, config, robot), sets, trajectory.command, plants, seeds
-        walks = verdicts.judge(*inputs, title=title, seconds=seconds, plant=plant, engine=engine)
+        walks = judging.judge(
+            Setup(pool, config, robot),
+            sets,
+            trajectory.command,
+            plants,
+            seeds,
+            title=title,
+            seconds=seconds,
+            plant=plant,
+            engine=engine,
+        )
     verdict = metrics.make_verdict(config.loss, seeds, {trajectory.name: walks.scores})
     title = f"{trajectory.name}, {plural(count, 'plant')}"
-    result = metrics.as_result(verdict, args.world) | {"engine": engine.name}
+    result = metrics.verdict_result(verdict, args.world) | {"engine": engine.name}
     if plant is not None:
         result["plant"] = plant.description.name
         title += f" of {plant.description.name}"
@@ -173,7 +183,7 @@ def grfm(args: Grfm) -> None:
             report_progress(3 * done, 3 * len(worlds), f"{world}: errors")
             start, push = walks.job.start_tick, walks.job.push
             samples, _ = make_dataset(robot, walks.trajectory, start, push=push)
-            errors = training.report(effects, samples)
+            errors = training.errors_by_phi(effects, samples)
             report_progress(3 * done + 1, 3 * len(worlds), f"{world}: errors by phase")
             phases = fidelity.by_phase(effects, samples)
             report_progress(3 * done + 2, 3 * len(worlds), f"{world}: open loop")
@@ -205,6 +215,6 @@ def _on_stand_in(setup: Setup, count: int) -> Walks:
         for seed, plant in enumerate(arguments.plants("standin", range(count), robot.description))
     ]
     title = f"walking on {plural(count, 'stand-in plant')}, for information"
-    walks = verdicts.walk_jobs(setup, jobs, title)
+    walks = judging.walk_jobs(setup, jobs, title)
     tick = setup.config.rollout.walk.gait.tick
     return Walks(stack(jobs), stack([at_interval(walk, tick) for walk in walks]))

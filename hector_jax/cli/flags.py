@@ -15,7 +15,7 @@ BASELINES = ("nominal", "expert")
 NAMED_WEIGHTS = (*BASELINES, "best")
 
 
-class Source(Enum):
+class PathKind(Enum):
     """What a flag names; its existence is checked before the slow imports."""
 
     FILE = "a file"
@@ -54,13 +54,13 @@ Gait = Literal["own", "walk", "trot", "pace", "crawl", "stand"]
 Family = Literal["standin", "even"]
 PlantWorld = Literal["ideal", "hfs", "hfs-varied", "hfs-even", "standin", "standin-even"]
 World = Literal["srbm", PlantWorld]
-RobotFile = Annotated[Path | None, Source.ROBOT]
-Weights = Annotated[str, Source.WEIGHTS]
-WeightSets = Annotated[str, Source.SETS]  # with an optional prefix NAME=
-Trajectory = Annotated[str, Source.TRAJECTORY]
+RobotFile = Annotated[Path | None, PathKind.ROBOT]
+Weights = Annotated[str, PathKind.WEIGHTS]
+WeightSets = Annotated[str, PathKind.SETS]  # with an optional prefix NAME=
+Trajectory = Annotated[str, PathKind.TRAJECTORY]
 Trajectories = tuple[Trajectory, ...]
-Run = Annotated[Path, Source.RUN]
-Folder = Annotated[Path, Source.FOLDER]
+Run = Annotated[Path, PathKind.RUN]
+Folder = Annotated[Path, PathKind.FOLDER]
 
 COMMANDS: dict[str, type[Any]] = {}
 """The flags of each command, by its name."""
@@ -182,10 +182,14 @@ class Tune(Configured, Parallel):
     # fall less under pushes; default 0.19 of the robot's height
     safe: Annotated[float | None, Range(0.001, 10)] = None
     data: Folder = Path("data")  # folder of the walks and the net, which are made if missing
-    net: Annotated[Path | None, Source.FILE] = None  # file of another net, instead of that in DATA
+    net: Annotated[Path | None, PathKind.FILE] = (
+        None  # file of another net, instead of that in DATA
+    )
     runs: Folder = Path("runs")  # the run folder is RUNS/TRAJ/TIME
     out: Path | None = None  # the run folder itself, which must not exist (with --each: OUT/TRAJ)
-    resume: Annotated[Path | None, Source.RUN] = None  # continue the interrupted run in this folder
+    resume: Annotated[Path | None, PathKind.RUN] = (
+        None  # continue the interrupted run in this folder
+    )
     video: bool = True  # make a film of the nominal and the best weights
     # print up to 12 walks more: in other engines, or else with other masses of the robot
     verdict: bool = False
@@ -221,7 +225,7 @@ class Report(Parallel, Printed):
 
     folder: Folder  # of `hector propose`
     # one of each trajectory, in their order or as NAME=FILE (docs/howto/walks.md)
-    logs: tuple[Annotated[str, Source.LOG], ...] = field(metadata={"or": "undo"})
+    logs: tuple[Annotated[str, PathKind.LOG], ...] = field(metadata={"or": "undo"})
     undo: bool = False  # take no logs, but take back the last report: its walk is waited for again
 
 
@@ -274,7 +278,7 @@ class Verdict(Configured, ForRobot, Parallel, Printed):
     weights: tuple[WeightSets, ...] = BASELINES
     traj: Trajectories = ("straight", "c", "s")  # trajectories: names or TOML files
     engine: tuple[JudgingEngine, ...] = ("c",)  # c: MuJoCo; or all: every one that is installed
-    plant: tuple[Annotated[Path, Source.ROBOT], ...] = ()  # TOML files of models of the robot
+    plant: tuple[Annotated[Path, PathKind.ROBOT], ...] = ()  # TOML files of models of the robot
     light_heavy: bool = False  # also the robot's own model with masses times 0.9 and 1.1
     family: Family = "standin"  # of the plants; even: masses drawn evenly about the nominal ones
     seeds: Plants = 8  # number of plants of the robot's own model, in the first engine
@@ -312,7 +316,7 @@ class Robot(Flags):
     Example: hector robot h1.xml --out h1.toml
     """
 
-    file: Annotated[Path, Source.FILE]  # MJCF, URDF, or the TOML file of a robot
+    file: Annotated[Path, PathKind.FILE]  # MJCF, URDF, or the TOML file of a robot
     out: Path | None = None  # new file for the proposal, with its model; else it is printed
 
 
@@ -331,11 +335,11 @@ class Export(Printed):
     Example: hector export latest
     """
 
-    run: Annotated[Path, Source.EXPORTABLE]  # run folder, `latest`, or a weights file
+    run: Annotated[Path, PathKind.EXPORTABLE]  # run folder, `latest`, or a weights file
     set: str = "best"  # weight set of the run
     out: Path | None = None  # folder; by default `export` in the run or beside the weights file
     # trajectory to check on; by default that of the run, or straight
-    traj: Annotated[str | None, Source.TRAJECTORY] = None
+    traj: Annotated[str | None, PathKind.TRAJECTORY] = None
     seconds: Seconds = 1.0  # length of that walk after the start-up [s]
     robot: RobotFile = None  # TOML file of the robot of a weights file; HECTOR by default
 

@@ -18,7 +18,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from hector_jax.cli.flags import COMMANDS, NAMED_WEIGHTS, Source, command, named_file, with_given
+from hector_jax.cli.flags import COMMANDS, NAMED_WEIGHTS, PathKind, command, named_file, with_given
 from hector_jax.core.inputs import InputError, check_file, did_you_mean, one_line, short_repr
 from hector_jax.core.settings import SEED, convert, from_table, read_json, read_toml, to_table
 
@@ -265,34 +265,34 @@ def _label(field: Any) -> str:
     return name.upper() if field.default is MISSING else f"--{name}"
 
 
-def _source(kind: Any) -> Source | None:
+def _source(kind: Any) -> PathKind | None:
     if get_origin(kind) is tuple:
         kind = get_args(kind)[0]
-    return next((note for note in get_args(kind) if isinstance(note, Source)), None)
+    return next((note for note in get_args(kind) if isinstance(note, PathKind)), None)
 
 
-def _check_source(label: str, value: Path | str, source: Source) -> None:
+def _check_source(label: str, value: Path | str, source: PathKind) -> None:
     """Check that a flag names a file or folder of its source that exists; else InputError."""
     text = str(value)
-    if source is Source.SETS:
+    if source is PathKind.SETS:
         text = str(Path(text.rpartition("=")[2]))  # without NAME=
-    if source is Source.LOG:
+    if source is PathKind.LOG:
         _, text = named_file(text)
     path, named, is_dir = Path(text), text in NAMED_WEIGHTS, os.path.isdir(text)
     existing = next(x for x in (path, *path.parents) if os.path.exists(x))
     valid, is_file = {
-        Source.FILE: (True, True),
-        Source.LOG: (True, True),
-        Source.RUN: (is_dir, False),
-        Source.FOLDER: (os.path.isdir(existing), False),
-        Source.EXPORTABLE: (True, not is_dir),
-        Source.WEIGHTS: (named or path.suffix or os.path.lexists(path), not named),
-        Source.SETS: (named or is_dir or path.suffix, not named and not is_dir),
-        Source.TRAJECTORY: (True, path.suffix == ".toml"),
-        Source.ROBOT: (path.suffix == ".toml", True),
+        PathKind.FILE: (True, True),
+        PathKind.LOG: (True, True),
+        PathKind.RUN: (is_dir, False),
+        PathKind.FOLDER: (os.path.isdir(existing), False),
+        PathKind.EXPORTABLE: (True, not is_dir),
+        PathKind.WEIGHTS: (named or path.suffix or os.path.lexists(path), not named),
+        PathKind.SETS: (named or is_dir or path.suffix, not named and not is_dir),
+        PathKind.TRAJECTORY: (True, path.suffix == ".toml"),
+        PathKind.ROBOT: (path.suffix == ".toml", True),
     }[source]
     if not valid:
-        of_sets = source in (Source.WEIGHTS, Source.SETS)
+        of_sets = source in (PathKind.WEIGHTS, PathKind.SETS)
         hint = did_you_mean(text, NAMED_WEIGHTS) if of_sets else ""
         raise InputError(f"{label} must be {source.value}, got {one_line(str(value))!r}{hint}")
     if is_file:
@@ -317,7 +317,7 @@ def resolve_latest(flags: Flags) -> Flags:
     values: dict[str, Any] = {}
     for field in fields(flags):  # pyright: ignore[reportArgumentType]
         value = getattr(flags, field.name)
-        if value is not None and _source(field.type) in (Source.RUN, Source.EXPORTABLE):
+        if value is not None and _source(field.type) in (PathKind.RUN, PathKind.EXPORTABLE):
             is_tuple = isinstance(value, tuple)
             values[field.name] = tuple(map(newest, value)) if is_tuple else newest(value)
     latest = replace(flags, **values)  # pyright: ignore[reportArgumentType]

@@ -19,9 +19,10 @@ from hector_jax.core.files import locked, make_folder, write_json
 from hector_jax.core.inputs import InputError, plural, unknown
 from hector_jax.core.runtime import workers
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import reported_walks, tunings, walk_log, walks
-from hector_jax.runs.campaign import Campaign
-from hector_jax.runs.folder import CONFIG
+from hector_jax.store import tunings
+from hector_jax.store.folder import CONFIG
+from hector_jax.walk_tuning import reported_walks, walk_log, walks
+from hector_jax.walk_tuning.campaign import Campaign
 
 
 def propose(args: Propose) -> None:
@@ -33,7 +34,10 @@ def propose(args: Propose) -> None:
     campaign = _campaign(args)
     make_folder(args.folder)
     with locked(args.folder), workers(args.processes) as pool:
-        rows, space = reported_walks.read_reports(pool, campaign), walks.space_of(pool, campaign)
+        rows, space = (
+            reported_walks.read_reports(pool, campaign),
+            walks.campaign_space(pool, campaign),
+        )
         proposal, _ = walks.next_proposal(pool, campaign, space, rows)
         if not path.exists():  # last, so that rejected flags can be corrected
             write_json(path, {"flags": as_table(args)})
@@ -69,8 +73,8 @@ def report(args: Report) -> None:
         named = [name for name, _ in map(named_file, texts)]
         tracked = _check_logs(campaign, number, files, named)
         rows = reported_walks.add_report(pool, campaign, proposal, list(files.values()))
-        _, best_number = walks.answer(campaign, walks.space_of(pool, campaign), rows)
-    changes = walks.changes(rows)
+        _, best_number = walks.answer(campaign, walks.campaign_space(pool, campaign), rows)
+    changes = walks.changes_by_walk(rows)
     last, best = _text(changes[-1]), _text(changes[best_number])
     weights = walks.weights_path(args.folder, best_number)
     result = {"walk": number, **changes[-1]._asdict(), "best": best_number, "weights": str(weights)}
@@ -124,7 +128,9 @@ def _check_logs(
     for name, file in files.items():
         log = walk_log.read_log(file, robot, campaign.seconds)
         inputs = campaign.config, robot
-        tracked = {n: walk_log.tracking(*inputs, x, log) for n, x in campaign.commands.items()}
+        tracked = {
+            n: walk_log.tracking_errors(*inputs, x, log) for n, x in campaign.commands.items()
+        }
         result[name] = tracked[name]
         say(f"{file}: {name}; {_tracking_text(result[name])}")
         if not walk_log.check_card(file, name, proposed, path) and name not in named:

@@ -19,16 +19,16 @@ from hector_jax.core.files import make_folder, write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.settings import convert
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs.cache import robot_hash
-from hector_jax.runs.campaign import with_leg_numbers
-from hector_jax.runs.folder import CONFIG, VERSIONS, flattened, read_object
-from hector_jax.runs.nets import COLLECTION_CODE
 from hector_jax.sim.engine import choose_engine
+from hector_jax.store.cache import robot_hash
+from hector_jax.store.folder import CONFIG, VERSIONS, flattened, read_object
+from hector_jax.store.nets import COLLECTION_CODE
+from hector_jax.walk_tuning.campaign import with_leg_numbers
 
 F = TypeVar("F", bound=Flags)
 
 TIME = "%Y%m%d-%H%M%S"  # names a run
-_CODE = (*COLLECTION_CODE, "grfm.training", "sim.standin", "runs.choice", "runs.walks")
+_CODE = (*COLLECTION_CODE, "grfm.training", "sim.standin", "verdict.choice", "walk_tuning.walks")
 # flags of a call, not of the run that it begins or resumes
 _CALL_FLAGS = ("config", "each", "out", "resume", "runs")
 # flags that may change when a run is resumed

@@ -34,19 +34,20 @@ from hector_jax.report.report import Picture, first_lines, print_table
 from hector_jax.report.run import write_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import choice, metrics, nets, tunings, verdicts
-from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, read_object
-from hector_jax.runs.setup import Setup
-from hector_jax.runs.verdicts import ScoredWalks
-from hector_jax.runs.walks import Campaign, Row, candidates, changes, tune_on_walks
 from hector_jax.sim.diagnosis import fall_of
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
+from hector_jax.store import nets, tunings
+from hector_jax.store.folder import CONFIG, METRICS, RESULT, VERSIONS, read_object
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.curvature import Determined, determined
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.evaluate import aligned
+from hector_jax.verdict import choice, judging, metrics
+from hector_jax.verdict.judging import ScoredWalks
+from hector_jax.walk_tuning.walks import Campaign, Row, candidates, changes_by_walk, tune_on_walks
 
 _ARTEFACTS = "kept"  # folder in it
 
@@ -133,7 +134,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     config = arguments.with_length(config, trajectories[0])
     start = arguments.weights(args.start, robot)
     data = arguments.data_folder(args.data, args.robot, robot)
-    net = nets.load_net(args.net, robot, args.variant)[0] if args.net else None
+    net = nets.load_trained(args.net, robot, args.variant)[0] if args.net else None
     with workers(args.processes) as pool:
         setup = Setup(pool, config, robot, made_with.get("commit", ""))
         inputs = setup, args.start, start, trajectories, folder / _ARTEFACTS / "hfs"
@@ -147,7 +148,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
             say(f"before any tuning, {trajectories[0].name} on hfs: {line}")
         net = net or nets.load_or_train(pool, robot, data, args.variant)
         run = _Run(setup, folder, args, start, trajectories, net)
-        norms = tunings.gradient_norms(run.setup, run.problems)
+        norms = tunings.mean_norms(run.setup, run.problems)
         if args.alpha == "auto":
             loss = aligned(config.loss, norms["with"])
             say("loss weights: " + ", ".join(f"{term.name} {term.weight:g}" for term in loss))
@@ -171,7 +172,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         determined=known,
         errors=run.net.errors,
         tunings=tuned.tunings,
-        proposals=changes(tuned.proposals),
+        proposals=changes_by_walk(tuned.proposals),
         best_proposal=tuned.best_proposal,
         cases=len(tuned.proposals[0].losses) if tuned.proposals else 0,
         chosen=tuned.chosen,
@@ -207,7 +208,7 @@ def _check_start(
     for name, command, seconds in trajectories:
         job = Job(start, command, plant, seconds or Walk.seconds)
         options = {"title": f"walking {name} with the weights to start from", "folder": folder}
-        walks = verdicts.score_jobs(setup, {case: job}, **options, with_walk=[case])
+        walks = judging.score_jobs(setup, {case: job}, **options, with_walk=[case])
         if walks[case][0].score.fallen:
             inputs = setup.config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
             fall = setup.pool.submit(fall_of, *inputs).result() or "fell"
@@ -244,7 +245,7 @@ def _tune_sets(run: _Run) -> _Tuned:
     config, start = run.answer
     problem = {"best": tunings.Problem(tuple(commands), run.net.params, choice.DRAWS)}
     folder = run.folder / _ARTEFACTS
-    tune_in = partial(tunings.tune, folder=folder, metrics=run.folder / METRICS)
+    tune_in = partial(tunings.tune_all, folder=folder, metrics=run.folder / METRICS)
     title = f"tuning {run.name} without and with GRFM-Net"
     done = tune_in(setup, run.problems, title=title, start=run.start)
     for_best = setup._replace(config=config)
@@ -269,8 +270,8 @@ def _tune_sets(run: _Run) -> _Tuned:
         campaign = _campaign(run, sets["before_walks"])
         proposals = tune_on_walks(setup.pool, campaign, run.args.walks)
         stages = candidates(setup.pool, campaign, proposals)
-        inputs = setup, stages, commands, choice.HELD_OUT
-        best = choice.walks_best(*inputs, **options, engine=campaign.engine)
+        engine = campaign.engine
+        best = choice.walks_best(setup, stages, commands, choice.HELD_OUT, engine=engine, **options)
         sets["best"] = stages[best]
     for name, weights in sets.items():
         save_weights(run.folder / "weights" / f"{name}.json", weights)
@@ -292,7 +293,7 @@ def _walk_sets(
     """Walk all sets on the stand-in plants and on the hfs; return the walks by trajectory."""
     seeds, description = range(run.args.seeds), run.setup.robot.description
     plants = arguments.plants("standin", seeds, description)
-    judge = partial(verdicts.judge, run.setup, sets, seconds=run.seconds)
+    judge = partial(judging.judge, run.setup, sets, seconds=run.seconds)
     simulator, walks = hfs(description), {}
     for name, command in run.commands.items():
         suffix = f" {name}" if len(run.trajectories) > 1 else ""
@@ -334,8 +335,8 @@ def _result(
         return metrics.make_verdict(run.setup.config.loss, range(plants[world]), scores)
 
     def content(names: Sequence[str], standin: metrics.Verdict) -> dict[str, Any]:
-        result = metrics.as_result(standin)
-        for name, on_hfs in metrics.as_result(verdict(names, 1), "hfs")["sets"].items():
+        result = metrics.verdict_result(standin)
+        for name, on_hfs in metrics.verdict_result(verdict(names, 1), "hfs")["sets"].items():
             result["sets"][name] |= on_hfs
         return result
 
@@ -346,7 +347,7 @@ def _result(
         by_name |= {name: verdict([name], 0) for name in names}
         result["trajectories"] = {name: content([name], by_name[name]) for name in names}
     if tuned.proposals:
-        result["walks"] = [change._asdict() for change in changes(tuned.proposals)]
+        result["walks"] = [change._asdict() for change in changes_by_walk(tuned.proposals)]
         result["best_of_walks"] = tuned.best_proposal
     result["chosen"] = tuned.chosen
     directions = [direction._asdict() for direction in known.directions]
@@ -361,8 +362,15 @@ def _draw(run: _Run, tuned: _Tuned, standin: ScoredWalks, on_hfs: ScoredWalks) -
     with ThreadPoolExecutor(1) as background:  # another process draws the film
         film = background.submit(_film, run, standin)
         curves = fidelity.curves(run.setup.robot, on_hfs.first["nominal"], effects)
-        inputs = tuned.sets, tuned.tunings, standin.first, curves, run.net.history
-        drawings = pictures.of_run(run.folder, run.setup.config, *inputs)
+        drawings = pictures.of_run(
+            run.folder,
+            run.setup.config,
+            sets=tuned.sets,
+            tunings=tuned.tunings,
+            walks=standin.first,
+            ground=curves,
+            training=run.net.history,
+        )
     return {"pictures": drawings, "film": film.result()}
 
 

@@ -20,33 +20,34 @@ from hector_jax.core.runtime import workers
 from hector_jax.core.settings import SEED
 from hector_jax.report import matrix as report
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import metrics, tunings, verdicts
-from hector_jax.runs.matrix import HEAVY, LIGHT, OWN, Cells, Column
-from hector_jax.runs.setup import Setup
 from hector_jax.sim.engine import Engine, choose_engine
 from hector_jax.sim.loop import Job
+from hector_jax.store import tunings
+from hector_jax.store.setup import Setup
+from hector_jax.verdict import judging, metrics
+from hector_jax.verdict.matrix import HEAVY, LIGHT, OWN, Cells, Column
 
 _ENGINES = get_args(JudgingEngine)[:-1]  # without `all`
 
 
-class Model(NamedTuple):
+class PlantModel(NamedTuple):
     """A model of the robot that plants are drawn from."""
 
     mass: float = 1.0  # factor of the mass of each plant
     plant: Robot | None = None  # None: the robot's own model
 
 
-_OTHER_MASSES = {LIGHT: Model(mass=0.9), HEAVY: Model(mass=1.1)}
+_OTHER_MASSES = {LIGHT: PlantModel(mass=0.9), HEAVY: PlantModel(mass=1.1)}
 
 
-class Plan(NamedTuple):
+class VerdictPlan(NamedTuple):
     """The walks of a verdict."""
 
     robot: Robot
     family: str
     trajectories: dict[str, tuple[NamedCommand, float]]  # by name, with the length of walks [s]
     sets: dict[str, dict[str, Weights]]  # by trajectory and set
-    models: dict[str, Model]
+    models: dict[str, PlantModel]
     columns: dict[Column, range]  # with the seeds of its plants
     engines: dict[str, Engine]
 
@@ -80,7 +81,7 @@ def verdict(args: Verdict) -> None:
     say(f"the report is {path}")
 
 
-def plan_of(args: Verdict) -> Plan:
+def plan_of(args: Verdict) -> VerdictPlan:
     """Make the plan of the flags, checked before any walk.
 
     Raises:
@@ -91,13 +92,13 @@ def plan_of(args: Verdict) -> Plan:
     for name, text in arguments.trajectories_by_name(args.traj).items():
         trajectory = arguments.load_trajectory(text, robot)
         trajectories[name] = trajectory, arguments.walk_seconds(args, trajectory)
-    models = {OWN: Model()} | (_OTHER_MASSES if args.light_heavy else {})
+    models = {OWN: PlantModel()} | (_OTHER_MASSES if args.light_heavy else {})
     for path in args.plant:
         plant = arguments.plant_of(path, robot)
         assert plant is not None  # the path is set
         if (name := plant.description.name) in models:
             raise InputError(f"--plant {path}: there is a model {name!r} already")
-        models[name] = Model(plant=plant)
+        models[name] = PlantModel(plant=plant)
     names = args.engine
     engines = _installed(say) if "all" in names else {name: choose_engine(name) for name in names}
     columns = {
@@ -106,7 +107,7 @@ def plan_of(args: Verdict) -> Plan:
         for model in models
     }
     sets = _sets(args, robot, trajectories)
-    return Plan(robot, args.family, trajectories, sets, models, columns, engines)
+    return VerdictPlan(robot, args.family, trajectories, sets, models, columns, engines)
 
 
 def _seeds(args: Verdict, *, first: bool, own: bool) -> range:
@@ -162,7 +163,7 @@ def _sets(
     }
 
 
-def _plan_text(plan: Plan) -> str:
+def _plan_text(plan: VerdictPlan) -> str:
     """Describe the number of walks, the plants, and the differences between engines."""
     per_plant = sum(map(len, plan.sets.values()))
     walks = plural(per_plant * sum(map(len, plan.columns.values())), "walk")
@@ -172,25 +173,25 @@ def _plan_text(plan: Plan) -> str:
     return "; ".join(parts)
 
 
-def walk_cells(setup: Setup, plan: Plan, folder: Path) -> Cells:
+def walk_cells(setup: Setup, plan: VerdictPlan, folder: Path) -> Cells:
     """Do all walks, engine by engine; walks whose scores are in the folder are not repeated."""
     scored = {}
     for name, engine in plan.engines.items():
         options = {"title": f"walking in {report.TITLES[name]}", "folder": folder, "engine": engine}
-        scored |= verdicts.score_jobs(setup, _jobs(plan, name), **options)
+        scored |= judging.score_jobs(setup, _jobs(plan, name), **options)
     cells = {}
     for column, seeds in plan.columns.items():
         for trajectory, sets in plan.sets.items():
             case, where = (*column, trajectory), report.cell_text((column, trajectory))
             walks = {name: [scored[*case, name, seed][0] for seed in seeds] for name in sets}
-            verdicts.say_faults({f"{name} on {where}": of_set for name, of_set in walks.items()})
+            judging.say_faults({f"{name} on {where}": of_set for name, of_set in walks.items()})
             scores = {name: [walk.score for walk in of_set] for name, of_set in walks.items()}
             by_scene, loss = {trajectory: scores}, setup.config.loss
             cells[column, trajectory] = metrics.make_verdict(loss, seeds, by_scene)
     return cells
 
 
-def _jobs(plan: Plan, engine: str) -> dict[verdicts.Case, Job]:
+def _jobs(plan: VerdictPlan, engine: str) -> dict[judging.Case, Job]:
     """Return the walks of an engine."""
     jobs, world = {}, "standin" if plan.family == "standin" else f"standin-{plan.family}"
     for column, seeds in plan.columns.items():
@@ -223,10 +224,10 @@ def small_verdict(
     """
     others = list(_installed(lambda message: None).items())[1:4]
     engines = dict(others) or {"c": choose_engine("c")}
-    models = {OWN: Model()} if others else _OTHER_MASSES
+    models = {OWN: PlantModel()} if others else _OTHER_MASSES
     columns = {Column(engine, model): range(1) for engine in engines for model in models}
     walks = {trajectory.name: (trajectory, seconds)}
     few = {trajectory.name: {name: sets[name] for name in ("nominal", "expert", "with", "best")}}
-    plan = Plan(setup.robot, "standin", walks, few, models, columns, engines)
+    plan = VerdictPlan(setup.robot, "standin", walks, few, models, columns, engines)
     cells = walk_cells(setup, plan, folder)
     return partial(report.print_verdict, cells, plan.differs, plan.family)

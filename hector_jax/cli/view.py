@@ -16,8 +16,9 @@ from hector_jax.report.plots.style import titled
 from hector_jax.report.report import WORLDS
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import compile_model
-from hector_jax.runs import metrics, nets
-from hector_jax.runs.folder import read_histories, read_request, weights_of
+from hector_jax.store import nets
+from hector_jax.store.folder import read_histories, read_request, weights_of
+from hector_jax.verdict import metrics
 
 
 def view_run(args: View) -> None:
@@ -52,7 +53,7 @@ def view_run(args: View) -> None:
         lines = [f"**{request.trajectory}** in {world}, seed {args.seed}"]
         say(f"walking in {args.world}, seed {args.seed}")
         for when, (name, (weights, words)) in zip(("before", "after"), sets.items(), strict=True):
-            trajectory = arguments.walk_once(args, robot, command, weights, None)
+            trajectory = arguments.walk_once(args, robot, command, weights)
             score = metrics.score(request.loss, trajectory)
             plane, loss = 100 * math.hypot(*score.rms_position[:2]), score.L / 1e6
             lines.append(f"{when}: {words}, {plane:.1f} cm off (RMS), L {loss:.3f}e6")

@@ -118,25 +118,30 @@ def make_dataset(
         push,
         NO_PUSH,
     )
-    samples, usable = _all_samples(config, robot, np.arange(count), starts, pushes, walks)
+    each = np.arange(count), starts, pushes, walks
+    samples, usable = _all_samples(config, robot, each)
     usable = np.asarray(usable)
     return jax.tree.map(lambda x: np.asarray(x)[usable], samples), int((~usable).sum())
 
 
 @partial(jax.jit, static_argnums=0)
-def _all_samples(config, robot, numbers, starts, pushes, walks):
-    return jax.vmap(partial(_samples, config, robot))(numbers, starts, pushes, walks)
+def _all_samples(config: WalkConfig, robot: Robot, each: tuple) -> tuple[Dataset, Array]:
+    return jax.vmap(partial(_samples, config, robot))(each)
 
 
 def _samples(
     config: WalkConfig,
     robot: Robot,
-    number: Int[Array, ""],
-    start_tick: Int[Array, ""],
-    push: Push,
-    walk: Trajectory,
+    one: tuple[Int[Array, ""], Int[Array, ""], Push, Trajectory],
 ) -> tuple[Dataset, Bool[Array, " n"]]:
-    """Return the samples of one walk and whether each is usable."""
+    """Return the samples of a walk and whether each is usable.
+
+    Args:
+        config: the gait.
+        robot: the rigid body.
+        one: number of the walk, gait tick of its t = 0, its push, and the walk.
+    """
+    number, start_tick, push, walk = one
     first, ticks = HISTORY - 1, walk.fallen.shape[0]
     current = jax.tree.map(lambda x: x[first:], walk._replace(period=None, initial=None))
     earlier = (walk.state, walk.reference, walk.feet)  # HISTORY > 1: the initial state is not used

@@ -188,7 +188,14 @@ def fit_nets(
     carry = _Carry(nets, _optimiser(*rates).init(nets), nets, (infinite,) * len(nets))
     for epoch, key_epoch in enumerate(jax.random.split(key, config.epochs), start=1):
         carry, row = _train_epoch(
-            output, config.batch, rates, scale, training, validation, carry, key_epoch
+            carry,
+            key_epoch,
+            output=output,
+            size=config.batch,
+            rates=rates,
+            scale=scale,
+            training=training,
+            validation=validation,
         )
         rows.append(jax.device_get(row))
         progress(epoch, History(*np.array(rows).T))
@@ -215,16 +222,17 @@ def _squares(output: Callable[[Array, Array], Array], nets: ByKind, samples: Sam
     return tuple(map(by_member, nets, samples.x, samples.y))
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(jax.jit, static_argnames=("output", "size"))
 def _train_epoch(
+    carry: _Carry,
+    key: Key[Array, ""],
+    *,
     output: Callable[[Array, Array], Array],
     size: int,
     rates: tuple[Any, Any],  # numbers or tracers
     scale: ByKind,
     training: Samples,
     validation: Samples,
-    carry: _Carry,
-    key: Key[Array, ""],
 ) -> tuple[_Carry, Float[Array, "4"]]:
     count = len(training.x[0])
     batch = min(size, count)

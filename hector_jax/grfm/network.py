@@ -76,14 +76,14 @@ def load_net(
     if (kind := card["kind"]) not in kinds:
         raise InputError(f"{path}: holds {kind}, expected {' or '.join(kinds)}")
     name = kinds[kind]
-    like = layout(name, tuple(card["about"]["hidden"]), walk_config(robot))
+    like = empty_params(name, tuple(card["about"]["hidden"]), walk_config(robot))
     params, card = load_tree(path, like, kind=kind, robot=robot)
     if not all(np.isfinite(p).all() for p in jax.tree.leaves(params)):
         raise InputError(f"{path}: a parameter of the net is not finite")
     return params, name, card
 
 
-def layout(variant: str, hidden: tuple[int, ...], config: WalkConfig) -> Params:
+def empty_params(variant: str, hidden: tuple[int, ...], config: WalkConfig) -> Params:
     """Return zeros in the parameters' shapes, as `load_tree` takes them; an axis of 0 is ticks."""
     sizes = len(config.gait.offsets), config.mpc.contact_model.axes
     shapes = _shapes(VARIANTS[variant], hidden, *sizes, jnp.result_type(float))

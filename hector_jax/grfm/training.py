@@ -85,7 +85,7 @@ def errors(effect: jax.tree_util.Partial, dataset: Dataset) -> Errors:
     )
 
 
-def report(
+def errors_by_phi(
     effects: Mapping[str, jax.tree_util.Partial], dataset: Dataset
 ) -> dict[str, dict[str, Any]]:
     """Return the errors of several phi on one dataset, as JSON values, by their names."""

@@ -160,8 +160,9 @@ def _inverse(n: int, P: Array, one: np.ndarray, zero: np.ndarray) -> tuple[Array
     return jnp.where(inside, (one + one) * eye - swept, eye), definite
 
 
-def _correct(qp: _Problem, M: Array, side: Array, x: Array, rows: Array, y: Array) -> tuple:
-    """Run one pass of the method of multipliers with the active rows. Returns x, A x and y."""
+def _correct(qp: _Problem, M: Array, side: Array, point: tuple[Array, Array, Array]) -> tuple:
+    """Run one pass of the method of multipliers with the active rows, on x, A x and y."""
+    x, rows, y = point
     active = side != 0
     y = jnp.where(active, y + qp.c * (rows - jnp.where(side > 0, qp.upper, qp.lower)), qp.zero)
     dx = -_times(M, qp.curve(x) + qp.q + qp.pull(y))
@@ -182,7 +183,7 @@ def _pivot(qp: _Problem, state: tuple) -> tuple:
     x, rows, y, side, M, tolerance, count, _ = state
     active = side != 0
     for _ in range(qp.passes):
-        x, rows, y = _correct(qp, M, side, x, rows, y)
+        x, rows, y = _correct(qp, M, side, (x, rows, y))
     over, under = rows - qp.upper, qp.lower - rows
     outside = jnp.where(active, -one, jnp.maximum(over, under))
     negative = jnp.where(active, jnp.where(side > 0, -y, y), -one)
@@ -250,14 +251,10 @@ def _kernel(
     shape: tuple[int, ...],
     curvature: float,
     barrier: Callable[[], Any],
-    P_ref: Any,
-    q_ref: Any,
-    A_ref: Any,
-    lower_ref: Any,
-    upper_ref: Any,
     *refs: Any,
 ) -> None:
-    out: Any = Guess(*refs)
+    P_ref, q_ref, A_ref, lower_ref, upper_ref, *out_refs = refs
+    out: Any = Guess(*out_refs)
     dtype, soft = P_ref.dtype, _softness(P_ref.dtype, curvature)
     c, shift, coarse, fine = (np.asarray(v, dtype) for v in soft[:4])
     one, zero, infinite = (np.asarray(v, dtype) for v in (1.0, 0.0, np.inf))
@@ -285,7 +282,7 @@ def _kernel(
     barrier()
     product = rows(x)
     for _ in range(soft.refinements):
-        x, product, y = _correct(qp, inverse, side, x, product, y)
+        x, product, y = _correct(qp, inverse, side, (x, product, y))
     barrier()
     _store(out.x, column, in_x, x)
     _store(out.y, number, in_y, y)

@@ -13,8 +13,8 @@ from rich.text import Text
 
 from hector_jax.core.inputs import InputError
 from hector_jax.report.report import VOID, plain_console
-from hector_jax.runs.folder import RESULT, Histories, Run
-from hector_jax.runs.metrics import BASELINES, Interval
+from hector_jax.store.folder import RESULT, Histories, Run
+from hector_jax.verdict.metrics import BASELINES, Interval
 
 
 def compare_runs(runs: Sequence[Run]) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from hector_jax.grfm.training import predict
 from hector_jax.report.report import WORLDS, Picture, render
 from hector_jax.robot import srbm
 from hector_jax.robot.model import Robot
-from hector_jax.runs.folder import RESULT
+from hector_jax.store.folder import RESULT
 
 PHASES = {  # time [s] since the switch of stance
     "first 30 ms": (0.0, 0.03),
@@ -80,13 +80,14 @@ def by_phase(
 
 
 def _predict_states(
-    config: gait.GaitConfig,
     robot: Robot,
-    ticks: int,
     effect: jax.tree_util.Partial | None,
     walk: Trajectory,
     start_tick: Int[Array, ""],
     first: Int[Array, ""],
+    *,
+    config: gait.GaitConfig,
+    ticks: int,
 ) -> State:
     """Simulate the rigid body; return its states at the ends of `ticks` ticks from `first` on."""
 
@@ -105,7 +106,7 @@ def _predict_states(
             effects = effect(window)
             ground, push = turn(effects.wrench, yaw), turn(effects.legs, yaw)
         feet = 0.5 * (walk.feet[j - 1] + walk.feet[j])
-        state = srbm.step(robot, state, ground, feet, config.tick, push)
+        state = srbm.step(robot, state, ground, feet, config.tick, load=push)
         return state, state
 
     initial = jax.tree.map(lambda s: s[first - 1], walk.state)
@@ -136,7 +137,7 @@ def drift(
     if not len(starts):
         raise InputError(f"walks of {fallen.shape[1]} ticks are too short to predict {ticks} ticks")
 
-    predict_walk = partial(_predict_states, config, robot, ticks)
+    predict_walk = partial(_predict_states, robot, config=config, ticks=ticks)
     over_starts = jax.vmap(predict_walk, in_axes=(None, None, None, 0))
     predicted = jax.jit(jax.vmap(over_starts, in_axes=(None, 0, 0, None)))(
         effect, jax.tree.map(jnp.asarray, walks), jnp.asarray(start_tick), jnp.asarray(starts)

@@ -11,10 +11,10 @@ from hector_jax.core.files import write_file, write_json
 from hector_jax.core.inputs import plural
 from hector_jax.report import plots
 from hector_jax.report.report import Picture, change_text, markdown_table, render, seeds_text
-from hector_jax.runs import matrix
-from hector_jax.runs.matrix import OWN, Cells, Column
-from hector_jax.runs.metrics import BASELINES, FEWEST, Interval, compare
 from hector_jax.sim.engine import ENGINES
+from hector_jax.verdict import matrix
+from hector_jax.verdict.matrix import OWN, Cells, Column
+from hector_jax.verdict.metrics import BASELINES, FEWEST, Interval, compare
 
 TITLES = {name: engine.title for name, engine in ENGINES.items()}
 _COARSE = 8  # with fewer plants, intervals are coarse
@@ -55,7 +55,7 @@ def claims(cells: Cells, differs: Mapping[str, str], family: str) -> dict[str, l
     pairs = [(n, b) for n in names for b in BASELINES if b in names and b != n]
     pairs = [(n, b) for n, b in pairs if n not in BASELINES] or pairs[-1:]
     seeds = {column: verdict.seeds for (column, _), verdict in cells.items()}
-    changes = {pair: matrix.changes(cells, *pair) for pair in pairs}
+    changes = {pair: matrix.changes_by_cell(cells, *pair) for pair in pairs}
     fill = partial(
         render,
         matrix=matrix,
@@ -146,7 +146,7 @@ def write_report(
         "config": dict(config),
         "environment": dict(environment),
     }
-    result = matrix.as_result(cells, family) | {"differs": dict(differs), **contents}
+    result = matrix.matrix_result(cells, family) | {"differs": dict(differs), **contents}
     picture = Picture("verdict.png", plots.matrix(folder / "verdict.png", cells, title_of))
     text = render(
         "matrix.md.j2",

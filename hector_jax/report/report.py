@@ -20,8 +20,8 @@ from rich.table import Table
 from rich.text import Text
 
 from hector_jax.core.inputs import plural
-from hector_jax.runs import metrics
-from hector_jax.runs.metrics import BASELINES, Comparison, Summary, Verdict
+from hector_jax.verdict import metrics
+from hector_jax.verdict.metrics import BASELINES, Comparison, Summary, Verdict
 
 # titles of worlds that differ from their names
 WORLDS = {"standin": "hardware stand-in", "standin-even": "hardware stand-in, family even"}

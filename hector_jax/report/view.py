@@ -25,7 +25,7 @@ from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.report.motion import INK, Motion
 from hector_jax.report.plots.style import rgb_of
 from hector_jax.report.report import render
-from hector_jax.runs.folder import METRICS, RESULT, loss_curves, progress_sentence, read_histories
+from hector_jax.store.folder import METRICS, RESULT, loss_curves, progress_sentence, read_histories
 
 _RATE = 30.0  # displayed ticks per second, at most
 _PAUSE = 1.0  # [s] between readings of the metrics

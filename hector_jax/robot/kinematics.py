@@ -64,6 +64,7 @@ def inverse_legs(
     yaw: Float[Array, " feet"],
     up: Float[Array, "feet 3"],
     start: Float[Array, " joints"],
+    *,
     steps: int = NEWTON_STEPS,
 ) -> Float[Array, " joints"]:
     """Return the joint angles [rad] for target foot poses; the inverse of `foot_poses`.
@@ -86,7 +87,7 @@ def inverse_legs(
         up_yawed = jnp.stack([n @ rot_z(psi) for n, psi in zip(up, yaw, strict=True)])
         pitch = jnp.arctan2(up_yawed[:, 0], up_yawed[:, 2])
         return jax.vmap(_closed_form_inverse)(leg, position, yaw, pitch).reshape(-1)
-    inverse = jax.vmap(partial(_newton_inverse, robot.structure.placed, steps))
+    inverse = jax.vmap(partial(_newton_inverse, placed=robot.structure.placed, steps=steps))
     return inverse(leg, start.reshape(leg.lower.shape), position, yaw, up).reshape(-1)
 
 
@@ -239,13 +240,14 @@ def _general_chain(leg: _Leg, joints: Float[Array, " j"]) -> _Chain:
 
 
 def _newton_inverse(
-    placed: tuple[int, ...],
-    steps: int,
     leg: _Leg,
     start: Float[Array, " j"],
     position: Float[Array, "3"],
     yaw: Float[Array, ""],
     up: Float[Array, "3"],
+    *,
+    placed: tuple[int, ...],
+    steps: int,
 ) -> Float[Array, " j"]:
     rows = np.array(placed)
 

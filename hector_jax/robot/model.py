@@ -21,9 +21,9 @@ from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.checks import check_model, check_soles, standing_data, trunk_body
 from hector_jax.robot.description import DESCRIPTION_PATH, Description, read_description
-from hector_jax.robot.importer.source import build_spec
 from hector_jax.robot.links import data_at, inertia_about
 from hector_jax.robot.mjcf import mujoco_errors
+from hector_jax.robot.source import build_spec
 
 _CLOSED_AXES = np.eye(3)[[2, 0, 1, 1, 1]]  # yaw, roll, hip pitch, knee, ankle
 _TOLERANCE = 1e-6  # [m], [-]: between values of a model that are equal but for rounding

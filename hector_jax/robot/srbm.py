@@ -74,6 +74,7 @@ def step(
     wrench: Wrench,
     feet: Float[Array, "feet 3"],
     dt: float,
+    *,
     load: Load | None = None,
 ) -> State:
     """Return the state after `dt` [s] of constant wrench and load, world frame (Runge-Kutta 4)."""
@@ -96,6 +97,7 @@ def unexplained(
     after: State,
     wrench: Wrench,
     feet: Float[Array, "feet 3"],
+    *,
     dt: float,
 ) -> Load:
     """Return the load that explains the motion between two states in addition to the wrench.

@@ -137,7 +137,9 @@ def search(
     return {name: search.result() for name, search in searches.items()}
 
 
-def best(history: Sequence[Generation]) -> tuple[Float[np.ndarray, " directions"], float, int]:
+def best_point(
+    history: Sequence[Generation],
+) -> tuple[Float[np.ndarray, " directions"], float, int]:
     """Return steps, loss and number of the best walk; the number counts from 1."""
     steps, losses = map(np.concatenate, zip(*history, strict=True))
     index = int(np.argmin(losses))
@@ -183,7 +185,7 @@ class CmaSearch:
 
     def result(self) -> SearchResult:
         """Return the best weights so far."""
-        steps, loss, number = best(self.history)
+        steps, loss, number = best_point(self.history)
         weights = jax.device_get(weights_after(self.start, steps))
         return SearchResult(weights, loss, number, self.history, self.stop)
 

@@ -71,14 +71,16 @@ MUJOCO_C = Engine("c", "MuJoCo C", walk_many, _double)
 """MuJoCo C, one walk per process."""
 
 
-def _import_and_build(name: str, plant: str, job: Job, body: Robot, first: int, end: int) -> Plant:
+def _import_and_build(
+    job: Job, body: Robot, first: int, end: int, *, name: str, plant: str
+) -> Plant:
     """Import an optional engine's module, which nothing else imports, and build a plant of it."""
     return getattr(import_module(f"hector_jax.sim.{name}"), plant)(job, body, first, end)
 
 
 def _optional_engine(name: str, title: str, plant: str, package: str, differs: str) -> Engine:
     """Return an engine of an extra, one walk per process; `plant` is its class in sim/NAME.py."""
-    walk = partial(walk_many, build=partial(_import_and_build, name, plant))
+    walk = partial(walk_many, build=partial(_import_and_build, name=name, plant=plant))
     return Engine(name, title, walk, _double, ("sim.walk", f"sim.{name}"), package, differs)
 
 

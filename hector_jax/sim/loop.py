@@ -74,7 +74,7 @@ class Sample(NamedTuple):
     legs_touch: Bool[Array, "*batch"]
 
 
-def effect_of(robot: Robot, before: Float[Array, " reading"], ground: Ground) -> Wrench:
+def contact_effect(robot: Robot, before: Float[Array, " reading"], ground: Ground) -> Wrench:
     """Return the ground's wrench over a millisecond, its moments about the foot points.
 
     Args:
@@ -89,12 +89,12 @@ def effect_of(robot: Robot, before: Float[Array, " reading"], ground: Ground) ->
 def sample(
     config: WalkConfig,
     robot: Robot,
+    *,
     command: Command,
     anchor: Anchor,
     time: Float[Array, ""],
     yaw: Float[Array, ""],
     after: Float[Array, " reading"],
-    *,
     effect: Wrench,
     touches: Touches,
 ) -> Sample:

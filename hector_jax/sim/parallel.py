@@ -130,7 +130,7 @@ def _millisecond(
     contacts = jax.tree.map(widen, mjx_model.mjx_contacts(data))
     floor, foot_of_geom = jnp.asarray(places.floor), jnp.asarray(places.foot_of_geom)
     ground = sensing.ground_of(contacts, floor, foot_of_geom, len(robot.foot_point))
-    effect, touches = loop.effect_of(robot, before, ground), ground.touches
+    effect, touches = loop.contact_effect(robot, before, ground), ground.touches
     reading = sensing.unpack_reading(_read(program, walk, physics))
     fell = has_fallen(sensing.base_state(robot, reading, yaw), *robot.description.limits)
     fallen = carry.fallen | fell | touches.floor | mjx_model.in_floor(places, walk.model, data)
@@ -151,10 +151,17 @@ def _sample(
     tick, substep = clock
     time = tick[-1] + (substep[-1] + 1) / program.substeps
     after = _read(program, walk, carry.physics)
-    inputs = walk.robot, walk.job.command, carry.anchor, time, carry.yaw, after
-    effect = jax.tree.map(lambda w: w / program.period, carry.effect)
-    touches = Touches(carry.fallen, carry.legs)
-    sample = loop.sample(program.config, *inputs, effect=effect, touches=touches)
+    sample = loop.sample(
+        program.config,
+        walk.robot,
+        command=walk.job.command,
+        anchor=carry.anchor,
+        time=time,
+        yaw=carry.yaw,
+        after=after,
+        effect=jax.tree.map(lambda w: w / program.period, carry.effect),
+        touches=Touches(carry.fallen, carry.legs),
+    )
     carry = carry._replace(last=where(carry.fallen, carry.last, sample))
     return carry, carry.last._replace(fallen=carry.fallen)
 
@@ -206,8 +213,17 @@ def _init_carry(program: _Program, walk: _Walk, physics: _Physics) -> _Carry:
     memory = init_memory(robot, measurement)
     now = {"anchor": anchor, "tick": tick, "memory": memory, "measurement": measurement}
     _, shapes = jax.eval_shape(_step_plan(program, walk, len(robot.foot_point)), **now)
-    inputs = robot, job.command, anchor, 1.0 * tick, yaw, reading
-    sample = loop.sample(config, *inputs, effect=effect, touches=Touches(false, false))
+    sample = loop.sample(
+        config,
+        robot,
+        command=job.command,
+        anchor=anchor,
+        time=1.0 * tick,
+        yaw=yaw,
+        after=reading,
+        effect=effect,
+        touches=Touches(false, false),
+    )
     return _Carry(
         memory=memory,
         plan=jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes),
@@ -225,12 +241,11 @@ def _init_carry(program: _Program, walk: _Walk, physics: _Physics) -> _Carry:
 def _walk_one(
     program: _Program,
     robot: Robot,
-    model: mjx.Model,
-    qpos: Float[Array, " nq"],
+    standing: tuple[mjx.Model, Float[Array, " nq"]],
     job: Job,
     varied: dict[str, Array],
 ) -> Trajectory:
-    model = model.replace(**varied)
+    model, qpos = standing[0].replace(**varied), standing[1]
     data = mjx.make_data(model)
     if program.single:
         model, data = mjx_model.to_single((model, data))
@@ -251,8 +266,8 @@ def _walk_one(
 
 
 @partial(jax.jit, static_argnames="program")
-def _walk_all(program, robot, model, qpos, batch):
-    return jax.vmap(partial(_walk_one, program, robot, model, qpos))(*batch)
+def _walk_all(program, robot, standing, batch):
+    return jax.vmap(partial(_walk_one, program, robot, standing))(*batch)
 
 
 def _check_batch(jobs: Sequence[Job]) -> None:
@@ -327,4 +342,4 @@ def walk_batch(
     count = substeps(config)
     program = _Program(config, places, last_start, ticks, count, 1 if fine else count, single)
     batch = stack([as_arrays(job) for job in jobs]), varied
-    return _in_chunks(batch, len(jobs), chunk, partial(_walk_all, program, robot, model, qpos))
+    return _in_chunks(batch, len(jobs), chunk, partial(_walk_all, program, robot, (model, qpos)))

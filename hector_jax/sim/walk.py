@@ -12,7 +12,7 @@ from concurrent.futures import Executor
 from contextlib import suppress
 from functools import cache, partial
 from itertools import repeat
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from hector_jax.control import controller
 from hector_jax.control.controller import Memory, Plan, WalkConfig
 from hector_jax.control.parameters import Parameters
-from hector_jax.control.reference import Anchor, anchor_at, standing_anchor, with_pieces
+from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor, with_pieces
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import Trajectory
@@ -37,8 +37,6 @@ from hector_jax.sim.plant import BuildPlant, Plant
 from hector_jax.sim.sensing import Ground
 from hector_jax.sim.world import push_force
 
-_measure = jax.jit(sensing.measure)
-
 
 @jax.jit
 def _begin(robot: Robot, reading: Array) -> Memory:
@@ -52,22 +50,42 @@ def _anchor(robot: Robot, reading: Array, yaw: Array, start_tick: Array) -> Anch
     return anchor_at(robot, state, start_tick)
 
 
+class _Block(NamedTuple):
+    """What the samples of a block of ticks are read from."""
+
+    anchors: Anchor  # (ticks, ...)
+    ticks: Array  # (ticks,), of the gait
+    yaws: Array  # (ticks,), at the start of each [rad]
+    readings: Array  # (milliseconds + 1, reading)
+    contacts: Any  # of the plant, for `Plant.ground_of`
+
+
 @partial(jax.jit, static_argnames=("config", "ground_of"))
 def _samples(
-    config, robot, command, anchors, ticks, yaws, readings, contacts, *, ground_of
+    config: WalkConfig, robot: Robot, command: Command, block: _Block, *, ground_of: Any
 ) -> Sample:
     """Return the samples of a block of ticks."""
 
-    def sample(anchor, time, yaw, before, after, ground: Ground) -> Sample:
-        effect = loop.effect_of(robot, before, ground)
-        inputs = robot, command, anchor, time, yaw, after
-        return loop.sample(config, *inputs, effect=effect, touches=ground.touches)
+    def sample(start: tuple[Anchor, Array, Array], before, after, ground: Ground) -> Sample:
+        anchor, time, yaw = start
+        return loop.sample(
+            config,
+            robot,
+            command=command,
+            anchor=anchor,
+            time=time,
+            yaw=yaw,
+            after=after,
+            effect=loop.contact_effect(robot, before, ground),
+            touches=ground.touches,
+        )
 
+    anchors, ticks, yaws, readings, contacts = block
     count = substeps(config)
     times = (ticks[:, None] + (1 + jnp.arange(count)) / count).ravel()
     anchors, yaws = jax.tree.map(lambda x: jnp.repeat(x, count, axis=0), (anchors, yaws))
     ground = ground_of(robot, contacts)
-    return jax.vmap(sample)(anchors, times, yaws, readings[:-1], readings[1:], ground)
+    return jax.vmap(sample)((anchors, times, yaws), readings[:-1], readings[1:], ground)
 
 
 class _Planner:
@@ -144,7 +162,6 @@ def walk(
     job: Job,
     *,
     build: BuildPlant = MujocoPlant,
-    retune: Callable[..., Weights] | None = None,
 ) -> Trajectory:
     """Walk once, by default in MuJoCo C.
 
@@ -153,9 +170,6 @@ def walk(
         robot: its nominal robot; the plant is its MJCF, or that of the job.
         job: the walk.
         build: builds the plant in an engine.
-        retune: returns the weights of plans and legs at each tick from t = 0 on, instead of the
-            job's, from gait tick, anchor, measurement and the wrench commanded over the previous
-            tick; called for up to nine ticks after a fall too.
 
     Returns:
         Samples of 1 ms from t = 0 (numpy). After a fall they repeat the last valid sample and are
@@ -168,7 +182,7 @@ def walk(
     count, ticks = substeps(config), loop.walk_ticks(config, job.seconds, job.start_tick)
     lead, length = (job.start_tick - first_tick(config)) * count, ticks * count
     plant = build(job, job.body(robot), -lead, length)
-    blocks = zip(*_walk_blocks(config, robot, job, plant, ticks, retune), strict=True)
+    blocks = zip(*_walk_blocks(config, robot, job, plant, ticks=ticks), strict=True)
     plan, flat = (jax.tree.map(lambda *x: np.concatenate(x), *trees) for trees in blocks)
     # from a fall on, samples repeat the last valid one
     fell, good = np.flatnonzero(flat.fallen), len(flat.fallen) - 1
@@ -185,7 +199,7 @@ def walk(
 
 
 def _walk_blocks(
-    config: WalkConfig, robot: Robot, job: Job, plant: Plant, ticks: int, retune: Any
+    config: WalkConfig, robot: Robot, job: Job, plant: Plant, *, ticks: int
 ) -> Iterator[tuple[Plan, Sample]]:
     """Yield plans and samples of each block of ticks (numpy), until t = `ticks` or a fall."""
     count, first = substeps(config), first_tick(config)
@@ -211,15 +225,10 @@ def _walk_blocks(
     while step < steps:
         begin, plans, at_start = step, [], []
         for _ in range(_BLOCK if steps - step >= _BLOCK * count else 1):
-            tick, reading, error = first + step // count, readings[step], errors[step]
+            tick, reading = first + step // count, readings[step]
             if tick == start:
                 anchor = _anchor(body, reading, yaw, start)
                 packed_anchor = _pack(anchor)
-            if retune is not None and planner is not None and tick >= start:
-                measurement, _ = _measure(body, reading, yaw, error)
-                wrench = unpack(planner.layout, np.asarray(packed))[1].wrench
-                weights = retune(tick, anchor, measurement, wrench)
-                packed_constants = _pack((body, _parameters(config, weights), *constants[2:]))
             at_start.append((anchor, np.int32(tick), yaw))
             planner = planner_for(controller.contacts_needed(config, tick))
             inputs = packed_anchor, [tick], np.asarray(packed)[:memory_size], [yaw], rows[step, 1:]
@@ -236,8 +245,9 @@ def _walk_blocks(
             yaw = np.asarray(packed_state)[joints]
             if plant.broken:
                 break  # rare: the samples of less than a block are another program
-        inputs = *stack(at_start), readings[begin : step + 1], plant.ground()
-        samples = _samples(config, body, command, *inputs, ground_of=plant.ground_of)
+        anchors, ticks_done, yaws = stack(at_start)
+        block = _Block(anchors, ticks_done, yaws, readings[begin : step + 1], plant.ground())
+        samples = _samples(config, body, command, block, ground_of=plant.ground_of)
         assert planner is not None  # it has planned
         yield unpack(planner.layout, np.stack(plans))[1], jax.tree.map(np.asarray, samples)
         if plant.broken or np.asarray(samples.fallen).any():

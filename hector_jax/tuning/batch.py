@@ -28,16 +28,16 @@ from jaxtyping import Float, Int
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
-from hector_jax.core.trajectory import Trajectory
 from hector_jax.robot.model import Robot
 from hector_jax.tuning import difftune
 from hector_jax.tuning.curvature import gauss_newton
 from hector_jax.tuning.difftune import Iteration, TuneConfig, TuneState, Tuning
-from hector_jax.tuning.evaluate import Evaluation, evaluate
+from hector_jax.tuning.evaluate import Evaluation, Walk, evaluate
 from hector_jax.tuning.loss import PAPER_LOSS, Loss
 from hector_jax.tuning.parallel_rollout import parallel_rollout
-from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.tuning.status import Stop
+from hector_jax.tuning.variation import Variation
 
 AXIS = "problems"
 PER_CALL = 11  # evaluations per problem and call of the device: start and ten
@@ -48,7 +48,7 @@ COMPILER_OPTIONS = {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
 (docs/performance.md); a CPU ignores it."""
 
 
-class Scenario(NamedTuple):
+class BatchScenario(NamedTuple):
     """A rollout of a problem; leading axes of a batch: problems, scenarios."""
 
     command: Command
@@ -59,11 +59,11 @@ class Scenario(NamedTuple):
     variation: Variation | None = None  # None: the noise and delay of the config
 
 
-class Problem(NamedTuple):
+class BatchProblem(NamedTuple):
     """A weight set to be tuned."""
 
     start: Weights
-    scenarios: Scenario  # one leading axis
+    scenarios: BatchScenario  # one leading axis
     tail: Float[Array, "*batch"]  # share of the scenarios, worst first: 1 the mean, 0 the worst
 
 
@@ -89,9 +89,7 @@ def lanes_of(backend: str) -> int:
     return 1 if backend == "cpu" else 0
 
 
-def choose_rollout(
-    platform: str, config: RolloutConfig, rollouts: int
-) -> Callable[..., Trajectory]:
+def choose_rollout(platform: str, config: RolloutConfig, rollouts: int) -> Walk:
     """Choose `rollout` or `parallel_rollout` for the rollouts that one device computes.
 
     A GPU waits in each of a tick's many small steps, so that few rollouts are faster with all their
@@ -110,35 +108,45 @@ def _map(lanes: int, function: Callable, stacked: Any) -> Any:
     return jax.lax.map(function, stacked, batch_size=lanes)
 
 
+class _Program(NamedTuple):
+    """What a program is compiled for."""
+
+    config: TuneConfig
+    lanes: int  # problems in parallel on a device, 0 for all
+    walk: Walk
+    mesh: Mesh
+
+
 def _evaluate(
-    config: TuneConfig,
-    lanes: int,
-    walk: Callable[..., Trajectory],
+    program: _Program,
     robot: Robot,
     effects: jax.tree_util.Partial,
-    problem: Problem,
+    problem: BatchProblem,
     state: TuneState,
 ) -> tuple[Evaluation, Float[Array, "n n"]]:
     """Evaluate all scenarios of a problem as one; also return the matrix, where it is needed."""
+    config, lanes, walk, _ = program
     single = all(len(leaf) == 1 for leaf in jax.tree.leaves(effects))
     weights = difftune.trial_weights(config, state)
 
-    def over_scenarios(function: Callable[..., Any]) -> Any:
-        def of_scenario(scenario: Scenario) -> Any:
-            command, anchor, index, loss, scale, variation = scenario
-            effect = jax.tree.map(lambda leaf: leaf[0 if single else index], effects)
-            inputs = robot, weights, command, anchor, effect, loss, variation
-            return function(scale, config.rollout, *inputs, walk=walk)
+    def over_scenarios(function: Callable[[Scenario, Loss, Array], Any]) -> Any:
+        def of_scenario(of: BatchScenario) -> Any:
+            effect = jax.tree.map(lambda leaf: leaf[0 if single else of.effect], effects)
+            scenario = Scenario(robot, of.command, of.anchor, effect, of.variation)
+            return function(scenario, of.loss, of.scale)
 
         return _map(lanes, of_scenario, problem.scenarios)
 
-    def value(scale: Array, *inputs: Any, **options: Any) -> Evaluation:
-        found = evaluate(*inputs, **options)
-        loss, terms, gradient = jax.tree.map(lambda x: x / scale, found[:3])
-        return found._replace(loss=loss, terms=terms, gradient=gradient)
+    def value(scenario: Scenario, loss: Loss, scale: Array) -> Evaluation:
+        found = evaluate(config.rollout, scenario, weights, loss, walk=walk)
+        value, terms, gradient = jax.tree.map(lambda x: x / scale, found[:3])
+        return found._replace(loss=value, terms=terms, gradient=gradient)
 
-    def curvature(scale: Array, *inputs: Any, **options: Any) -> Array:
-        return gauss_newton(*inputs, **options, others=config.others) / scale
+    def curvature(scenario: Scenario, loss: Loss, scale: Array) -> Array:
+        matrix = gauss_newton(
+            config.rollout, scenario, weights, loss, walk=walk, others=config.others
+        )
+        return matrix / scale
 
     stacked = over_scenarios(value)
     weighted_sum = partial(jnp.tensordot, tail_weights(stacked.loss, problem.tail), axes=1)
@@ -152,25 +160,22 @@ def _evaluate(
     )
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 3), compiler_options=COMPILER_OPTIONS)
+@partial(jax.jit, static_argnums=0, compiler_options=COMPILER_OPTIONS)
 def _advance(
-    config: TuneConfig,
-    lanes: int,
-    walk: Callable[..., Trajectory],
-    mesh: Mesh,
+    program: _Program,
     robot: Robot,
     effects: jax.tree_util.Partial,
-    problems: Problem,
+    problems: BatchProblem,
     states: TuneState,
 ) -> tuple[TuneState, Iteration]:
     """Run up to PER_CALL iterations of each problem; returns the states and the iterations."""
 
-    def tune(robot: Robot, effects: jax.tree_util.Partial, inputs: tuple[Problem, TuneState]):
+    def tune(robot: Robot, effects: jax.tree_util.Partial, inputs: tuple[BatchProblem, TuneState]):
         problem, start = inputs
 
         def step(state: TuneState) -> tuple[TuneState, Iteration]:
-            found = _evaluate(config, lanes, walk, robot, effects, problem, state)
-            return difftune.update(config, state, *found)
+            evaluation, matrix = _evaluate(program, robot, effects, problem, state)
+            return difftune.update(program.config, state, evaluation, matrix)
 
         def record(carry: tuple) -> tuple:
             state, history, row = carry
@@ -180,16 +185,20 @@ def _advance(
 
         shapes = jax.eval_shape(step, start)[1]
         empty = jax.tree.map(lambda x: jnp.zeros((PER_CALL, *x.shape), x.dtype), shapes)
-        active = lambda carry: (carry[0].stop == Stop.GOING) & (carry[2] < PER_CALL)  # noqa: E731
+
+        def active(carry: tuple) -> Array:
+            state, _, row = carry
+            return (state.stop == Stop.GOING) & (row < PER_CALL)
+
         return jax.lax.while_loop(active, record, (start, empty, 0))[:2]
 
     def on_device(robot, effects, problems, states):
-        return _map(lanes, partial(tune, robot, effects), (problems, states))
+        return _map(program.lanes, partial(tune, robot, effects), (problems, states))
 
     replicated, split = PartitionSpec(), PartitionSpec(AXIS)
     return jax.shard_map(
         on_device,
-        mesh=mesh,
+        mesh=program.mesh,
         in_specs=(replicated, replicated, split, split),
         out_specs=split,
         check_vma=False,
@@ -212,12 +221,12 @@ def _fetch(tree: Any) -> Any:
 def tune_batch(
     config: TuneConfig,
     robot: Robot,
-    problems: Problem,
+    problems: BatchProblem,
     effects: jax.tree_util.Partial,
     *,
     devices: Sequence[Any] | None = None,
     lanes: int | None = None,
-    walk: Callable[..., Trajectory] | None = None,
+    walk: Walk | None = None,
     report_progress: Callable[[int, int, str], None] = lambda done, total, message: None,
 ) -> Tuning:
     """Tune all problems of a batch.
@@ -226,7 +235,7 @@ def tune_batch(
         config: the settings; its loss is ignored, each scenario has its own.
         robot: the body that the controllers assume.
         problems: stacked, see `stack`; the same on every host.
-        effects: phis, stacked too; `Scenario.effect` is the index into them.
+        effects: phis, stacked too; `BatchScenario.effect` is the index into them.
         devices: on which to compute; None takes all.
         lanes: problems in parallel on a device, 0 for all; None takes `lanes_of` the backend.
         walk: `rollout` or `parallel_rollout`; None takes `choose_rollout`.
@@ -256,10 +265,10 @@ def tune_batch(
     states.stop[count:] = Stop.LIMIT
     filled, states = _place(mesh, filled), _place(mesh, states)
 
-    histories, active = [], count
+    program, histories, active = _Program(config, lanes, walk, mesh), [], count
     report_progress(0, count, f"compiling for {len(devices)} devices ({devices[0].device_kind})")
     while active:
-        states, history = _advance(config, lanes, walk, mesh, robot, effects, filled, states)
+        states, history = _advance(program, robot, effects, filled, states)
         stop, loss = _fetch((states.stop, states.rule.value))
         histories.append(_fetch(history))
         active = int(np.sum(stop[:count] == Stop.GOING))
@@ -271,19 +280,25 @@ def tune_batch(
     return jax.device_get(jax.vmap(partial(difftune.result, config))(final, history))
 
 
-def _check_problems(config: TuneConfig, problems: Problem, effects: jax.tree_util.Partial) -> int:
+def _check_problems(
+    config: TuneConfig, problems: BatchProblem, effects: jax.tree_util.Partial
+) -> int:
     """Check the problems of a batch and return their number."""
     scenarios, tail = problems.scenarios, np.asarray(problems.tail)
     if tail.ndim != 1 or not len(tail):
-        raise ValueError(f"Problem.tail must be stacked, one per problem, got shape {tail.shape}")
+        raise ValueError(
+            f"BatchProblem.tail must be stacked, one per problem, got shape {tail.shape}"
+        )
     if not ((tail >= 0) & (tail <= 1)).all():
-        raise ValueError(f"Problem.tail must be from 0 to 1, got {tail.min()} to {tail.max()}")
+        raise ValueError(f"BatchProblem.tail must be from 0 to 1, got {tail.min()} to {tail.max()}")
     phis = min((len(leaf) for leaf in jax.tree.leaves(effects)), default=1)
     index = np.asarray(scenarios.effect)
     if index.min() < 0 or index.max() >= phis:
-        raise ValueError(f"Scenario.effect must be below {phis}, got {index.min()}..{index.max()}")
+        raise ValueError(
+            f"BatchScenario.effect must be below {phis}, got {index.min()}..{index.max()}"
+        )
     if not (np.asarray(scenarios.scale) > 0).all():
-        raise ValueError("Scenario.scale must be positive")
+        raise ValueError("BatchScenario.scale must be positive")
     if scenarios.variation is not None:
         delay, tick = np.asarray(scenarios.variation.delay), config.rollout.walk.gait.tick
         if delay.min() < 0 or delay.max() > tick:

@@ -15,13 +15,12 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.control.parameters import step_names, stepped
-from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench
-from hector_jax.robot.model import Robot
+from hector_jax.tuning.evaluate import Walk
 from hector_jax.tuning.loss import Loss, losses, total
-from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 
 _NAMED = 0.35  # a direction is named by the weights of at least this share of its largest entry
 _FLAT = 1e-3  # a direction that changes the loss by less than this share does not matter
@@ -60,20 +59,17 @@ class Determined(NamedTuple):
 
 def gauss_newton(
     config: RolloutConfig,
-    robot: Robot,
+    scenario: Scenario,
     weights: Weights,
-    command: Command,
-    anchor: Anchor,
-    effect: jax.tree_util.Partial,
     loss: Loss,
-    variation: Variation | None = None,
-    walk: Callable[..., Trajectory] = rollout,
+    *,
+    walk: Walk = rollout,
     others: tuple[str, ...] = (),
 ) -> Float[Array, "n n"]:
     """Return the Gauss-Newton matrix of the loss of a rollout.
 
     Args:
-        config, robot, command, anchor, effect, variation: of the rollout.
+        config, scenario: of the rollout.
         weights: the point of evaluation.
         loss: terms and their weights.
         walk: `rollout` or `parallel_rollout`.
@@ -82,15 +78,14 @@ def gauss_newton(
     Returns:
         The matrix in the n coordinates of `parameters.stepped`.
     """
-    inputs = {"command": command, "anchor": anchor, "effect": effect, "variation": variation}
-    return matrix(partial(walk, config, robot, **inputs), weights, loss, others)
+    return gauss_newton_of(partial(walk, config, scenario), weights, loss, others)
 
 
 gauss_newton_jit = jax.jit(gauss_newton, static_argnums=0, static_argnames=("walk", "others"))
 """`gauss_newton`, compiled once per rollout and set of terms."""
 
 
-def matrix(
+def gauss_newton_of(
     walk: Callable[[Weights], Trajectory],
     weights: Weights,
     loss: Loss,

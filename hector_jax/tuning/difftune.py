@@ -27,19 +27,17 @@ from jaxtyping import Float, Int
 
 from hector_jax.control import parameters
 from hector_jax.control.controller import WalkConfig
-from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, directions, nominal, weights_to_vector
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError, plural, short_repr, unknown
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, check
 from hector_jax.core.trajectory import Wrench
 from hector_jax.core.tree import stack, where
-from hector_jax.robot.model import Robot
 from hector_jax.tuning import step_rules
 from hector_jax.tuning.curvature import gauss_newton_jit
 from hector_jax.tuning.evaluate import Evaluation, Objective, evaluate_jit
 from hector_jax.tuning.loss import PAPER_LOSS, alphas, check_loss
-from hector_jax.tuning.rollout import RolloutConfig, Variation
+from hector_jax.tuning.rollout import RolloutConfig, Scenario
 from hector_jax.tuning.status import StepStatus, Stop, status_text
 from hector_jax.tuning.step_rules import StepState
 
@@ -164,18 +162,9 @@ class Tuning(NamedTuple):
         }[Stop(int(self.stop))]
 
 
-def tune_step(
-    config: TuneConfig,
-    robot: Robot,
-    weights: Weights,
-    command: Command,
-    anchor: Anchor,
-    effect: jax.tree_util.Partial,
-    variation: Variation | None = None,
-) -> Evaluation:
+def tune_step(config: TuneConfig, scenario: Scenario, weights: Weights) -> Evaluation:
     """Evaluate weights with the rollout and the loss of a tuning, compiled."""
-    inputs = robot, weights, command, anchor, effect, config.loss, variation
-    return evaluate_jit(config.rollout, *inputs)
+    return evaluate_jit(config.rollout, scenario, weights, config.loss)
 
 
 def step_rule(config: TuneConfig, start: Weights) -> optax.GradientTransformationExtraArgs:
@@ -294,18 +283,15 @@ def result(config: TuneConfig, state: TuneState, history: Iteration) -> Tuning:
 
 def tune(
     config: TuneConfig,
-    robot: Robot,
+    scenario: Scenario,
     weights: Weights,
-    command: Command,
-    anchor: Anchor,
-    effect: jax.tree_util.Partial,
     on_iteration: Callable[[Iteration], None] = lambda iteration: None,
 ) -> Tuning:
     """Tune the weights on the model.
 
     Args:
         config: the settings.
-        robot, command, anchor, effect: the model, see `rollout`.
+        scenario: the model, see `rollout`.
         weights: the start.
         on_iteration: called after each iteration; the start is iteration 0.
 
@@ -314,24 +300,13 @@ def tune(
 
     Source: problem P.
     """
-    return descend(
-        config, weights, model_objective(config, robot, command, anchor, effect), on_iteration
-    )
+    return descend(config, weights, model_objective(config, scenario), on_iteration)
 
 
-def model_objective(
-    config: TuneConfig,
-    robot: Robot,
-    command: Command,
-    anchor: Anchor,
-    effect: jax.tree_util.Partial,
-    variation: Variation | None = None,
-) -> Objective:
+def model_objective(config: TuneConfig, scenario: Scenario) -> Objective:
     """Return the objective of a tuning on the model, see `rollout`."""
-    model = {"command": command, "anchor": anchor, "effect": effect, "variation": variation}
-    matrix = partial(gauss_newton_jit, config.rollout, robot, loss=config.loss, **model)
-    evaluate = partial(tune_step, config, robot, **model)
-    return Objective(evaluate, partial(matrix, others=config.others))
+    matrix = partial(gauss_newton_jit, config.rollout, scenario, loss=config.loss)
+    return Objective(partial(tune_step, config, scenario), partial(matrix, others=config.others))
 
 
 def descend(

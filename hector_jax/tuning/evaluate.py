@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, weights_to_vector
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError, unknown
 from hector_jax.core.trajectory import Trajectory
-from hector_jax.robot.model import Robot
 from hector_jax.tuning.loss import Loss, Terms, losses, total, with_alphas
-from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
+
+Walk = Callable[[RolloutConfig, Scenario, Weights], Trajectory]
 
 
 class Evaluation(NamedTuple):
@@ -46,26 +46,22 @@ def evaluation(walk: Callable[[Weights], Trajectory], weights: Weights, loss: Lo
 
 def evaluate(
     config: RolloutConfig,
-    robot: Robot,
+    scenario: Scenario,
     weights: Weights,
-    command: Command,
-    anchor: Anchor,
-    effect: jax.tree_util.Partial,
     loss: Loss,
-    variation: Variation | None = None,
-    walk: Callable[..., Trajectory] = rollout,
+    *,
+    walk: Walk = rollout,
 ) -> Evaluation:
     """Compute the loss of a weight set on the model and its gradient, in one program.
 
     Args:
-        config, robot, weights, command, anchor, effect, variation: see `rollout`.
+        config, scenario, weights: see `rollout`.
         loss: terms and their weights.
         walk: `rollout`, or `parallel_rollout` on a GPU with few rollouts.
 
     Source: Eq. 9, 11.
     """
-    inputs = {"command": command, "anchor": anchor, "effect": effect, "variation": variation}
-    return evaluation(partial(walk, config, robot, **inputs), weights, loss)
+    return evaluation(partial(walk, config, scenario), weights, loss)
 
 
 evaluate_jit = jax.jit(evaluate, static_argnums=0, static_argnames="walk")
@@ -107,19 +103,13 @@ def mean_objective(
 
 
 def gradient_norms(
-    config: RolloutConfig,
-    robot: Robot,
-    weights: Weights,
-    command: Command,
-    anchor: Anchor,
-    effect: jax.tree_util.Partial,
-    loss: Loss,
+    config: RolloutConfig, scenario: Scenario, weights: Weights, loss: Loss
 ) -> dict[str, float]:
     """Return the norm of each term's gradient in log-weights, without its alpha."""
 
     def norm(name: str) -> float:
         single = tuple(term._replace(weight=float(term.name == name)) for term in loss)
-        evaluation = evaluate_jit(config, robot, weights, command, anchor, effect, single)
+        evaluation = evaluate_jit(config, scenario, weights, single)
         logs = jax.tree.map(jnp.multiply, evaluation.gradient, weights)
         return float(jnp.linalg.norm(weights_to_vector(logs)))
 

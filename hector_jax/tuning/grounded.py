@@ -17,15 +17,21 @@ from hector_jax.control.controller import measured_feet
 from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
 from hector_jax.control.footstep import Feet
 from hector_jax.control.legs import Measurement
-from hector_jax.control.reference import Anchor, Command, anchor_at
+from hector_jax.control.reference import Anchor, anchor_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
 from hector_jax.robot.model import Robot
-from hector_jax.tuning.curvature import matrix
+from hector_jax.tuning.curvature import gauss_newton_of
 from hector_jax.tuning.evaluate import Evaluation, evaluation
 from hector_jax.tuning.loss import Loss
-from hector_jax.tuning.rollout import Carry, RolloutConfig, command_history, step_carry
+from hector_jax.tuning.rollout import (
+    Carry,
+    RolloutConfig,
+    Scenario,
+    command_history,
+    step_carry,
+)
 
 
 class MeasuredState(NamedTuple):
@@ -54,9 +60,7 @@ class Grounding(NamedTuple):
     Estimates are not used: commands are planned anew, from the true states of the walk.
     """
 
-    robot: Robot  # nominal body
-    command: Command  # of the walk
-    effect: jax.tree_util.Partial  # phi
+    scenario: Scenario  # with the nominal body and the command and the anchor of the walk
     start: Carry  # at the end of the first tick
     tick: Int[Array, ""]  # gait tick at the start
     residuals: MeasuredState  # (T - 1, ...) measured less modelled values at the end of a tick
@@ -65,10 +69,8 @@ class Grounding(NamedTuple):
 @partial(jax.jit, static_argnums=0)
 def fit_grounding(
     config: RolloutConfig,
-    robot: Robot,
+    scenario: Scenario,
     weights: Weights,
-    command: Command,
-    effect: jax.tree_util.Partial,
     walk: Trajectory,
     start_tick: Int[Array, ""] | int = 0,
 ) -> Grounding:
@@ -76,9 +78,8 @@ def fit_grounding(
 
     Args:
         config: controller, and the T ticks of the walk.
-        robot: nominal body.
-        weights, command: of the walk.
-        effect: phi.
+        scenario: nominal body, phi and command; the walk gives the anchor.
+        weights: of the walk.
         walk: true states, joints and commands, sampled at the plan interval: T samples.
         start_tick: gait tick of t = 0.
 
@@ -87,6 +88,7 @@ def fit_grounding(
 
     Source: Eq. 12, 13 at the measured states.
     """
+    robot = scenario.robot
     measured = measured_states(robot, walk.state, walk.joints)
     first, command_before = jax.tree.map(lambda x: x[0], (measured, walk.command))
     anchor, tick = anchor_at(robot, walk.initial, start_tick), jnp.asarray(start_tick) + 1
@@ -94,7 +96,7 @@ def fit_grounding(
     def step(memory: tuple[Wrench, Disturbance], inputs: tuple) -> tuple[tuple, MeasuredState]:
         begin, end, tick = inputs
         carry = carry_from(begin, anchor, *memory)
-        after, _ = step_carry(config, robot, weights, command, effect, carry, tick)
+        after, _ = step_carry(config, scenario, weights, carry, tick)
         residual = jax.tree.map(jnp.subtract, end, MeasuredState(after.state, after.feet))
         return (after.commands, after.disturbance), residual
 
@@ -102,7 +104,7 @@ def fit_grounding(
     memory = command_history(command_before), NO_DISTURBANCE
     _, residuals = jax.lax.scan(step, memory, (begins, ends, tick + jnp.arange(config.ticks - 1)))
     start = carry_from(first, anchor, *memory)
-    return Grounding(robot, command, effect, start, tick, residuals)
+    return Grounding(scenario._replace(anchor=anchor), start, tick, residuals)
 
 
 def grounded_rollout(config: RolloutConfig, grounding: Grounding, weights: Weights) -> Trajectory:
@@ -118,14 +120,14 @@ def grounded_rollout(config: RolloutConfig, grounding: Grounding, weights: Weigh
 
     Source: Eq. 12, 13 and the measured residuals.
     """
-    robot, command, effect, start, tick, residuals = grounding
+    scenario, start, tick, residuals = grounding
 
     @partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(qp.SAVED))
     def step(carry: Carry, inputs: tuple) -> tuple[Carry, Trajectory]:
         residual, tick = inputs
-        after, sample = step_carry(config, robot, weights, command, effect, carry, tick)
+        after, sample = step_carry(config, scenario, weights, carry, tick)
         state, feet = jax.tree.map(jnp.add, MeasuredState(after.state, after.feet), residual)
-        fallen = carry.fallen | has_fallen(state, *robot.description.limits)
+        fallen = carry.fallen | has_fallen(state, *scenario.robot.description.limits)
         after = after._replace(state=state, feet=feet, fallen=fallen)
         return after, sample._replace(state=state, feet=feet.position, fallen=fallen)
 
@@ -158,4 +160,4 @@ def grounded_matrix(
     others: tuple[str, ...] = (),
 ) -> Float[Array, "n n"]:
     """Compute the Gauss-Newton matrix of a grounded rollout; see `curvature.gauss_newton`."""
-    return matrix(partial(grounded_rollout, config, grounding), weights, loss, others)
+    return gauss_newton_of(partial(grounded_rollout, config, grounding), weights, loss, others)

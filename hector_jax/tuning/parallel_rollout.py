@@ -26,23 +26,22 @@ from hector_jax.control import gait
 from hector_jax.control.controller import contacts_needed
 from hector_jax.control.footstep import Feet
 from hector_jax.control.mpc import feet_of_contacts
-from hector_jax.control.reference import Anchor, Command, reference_at
+from hector_jax.control.reference import Anchor, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
 from hector_jax.core.tree import pack
-from hector_jax.robot.model import Robot
 from hector_jax.tuning.rollout import (
     Carry,
     RolloutConfig,
-    Variation,
-    from_start,
+    Scenario,
     init_carry,
     step_carry,
-    variation_of,
     varied,
     walked_ticks,
     with_constants,
+    with_variation,
+    without_lead,
 )
 
 
@@ -56,13 +55,7 @@ class _Step(NamedTuple):
 
 
 def _linearised(
-    config: RolloutConfig,
-    robot: Robot,
-    weights: Weights,
-    command: Command,
-    effect: jax.tree_util.Partial,
-    variation: Variation | None,
-    start: Carry,
+    config: RolloutConfig, scenario: Scenario, weights: Weights, start: Carry
 ) -> Callable[[jax.Array, Array], _Step]:
     """Return a function that steps and linearises a tick from the carry before it and its number.
 
@@ -75,8 +68,7 @@ def _linearised(
     def step(inputs: jax.Array, tick: Array, wrench: Wrench | None = None) -> tuple:
         before, weights = jnp.split(inputs, (len(packed),))
         carry = with_constants(to_parts(before), start)
-        rest = to_weights(weights), command, effect, carry, tick, variation, wrench
-        return step_carry(config, robot, *rest)
+        return step_carry(config, scenario, to_weights(weights), carry, tick, wrench=wrench)
 
     def linearise(before: jax.Array, tick: Array) -> _Step:
         inputs = jnp.concatenate([before, theta])
@@ -157,15 +149,7 @@ def _newton(
     return steps, converged
 
 
-def parallel_rollout(
-    config: RolloutConfig,
-    robot: Robot,
-    weights: Weights,
-    command: Command,
-    anchor: Anchor,
-    effect: jax.tree_util.Partial,
-    variation: Variation | None = None,
-) -> Trajectory:
+def parallel_rollout(config: RolloutConfig, scenario: Scenario, weights: Weights) -> Trajectory:
     """Walk on the single rigid body, all ticks at once.
 
     Takes what `rollout` takes and returns the same up to a fall, but for rounding. It can be
@@ -174,11 +158,9 @@ def parallel_rollout(
 
     Source: Eq. 12, 13; the method in the module's docstring.
     """
-    variation = variation_of(config) if variation is None else variation
-    fixed, robot, command, anchor, effect, variation = jax.lax.stop_gradient(
-        (weights, robot, command, anchor, effect, variation)
-    )
-    start, ticks = init_carry(robot, anchor, variation), walked_ticks(config, anchor)
+    fixed, scenario = jax.lax.stop_gradient((weights, with_variation(config, scenario)))
+    robot, command, anchor, *_ = scenario
+    start, ticks = init_carry(scenario), walked_ticks(config, anchor)
     packed, to_parts = ravel_pytree(varied(start))
     dt, size = config.walk.gait.tick, len(packed)
 
@@ -198,7 +180,7 @@ def parallel_rollout(
         anchor = anchor._replace(tick=start.anchor.tick)
         return reference_at(dt, command, anchor, tick + 1.0)
 
-    linearise = _linearised(config, robot, fixed, command, effect, variation, start)
+    linearise = _linearised(config, scenario, fixed, start)
     guesses = jax.vmap(guess)(ticks).at[0].set(packed)
     steps, converged = _newton(linearise, standing, guesses, ticks)
     outputs = _solve_recurrence(steps, pack(weights))  # has the derivative by the weights
@@ -215,4 +197,4 @@ def parallel_rollout(
         fallen=~standing(steps.outputs[:, :size]),  # as in `_newton`
         residual=jnp.where(converged, steps.sample.residual, jnp.inf),
     )
-    return from_start(config, samples)
+    return without_lead(config, samples)

@@ -3,9 +3,6 @@
 This is the only world that is differentiated. A tick solves the MPC, evaluates phi for the reaction
 of the ground and moves the body; its only memory is `Carry`. A foot in the air moves to the
 touchdown that phi predicts, and an early touchdown that phi predicts acts there.
-
-A `Variation` makes the body and its ground differ from the controller's model; weights that are
-tuned over several drawn ones are robust to that.
 """
 
 from dataclasses import dataclass
@@ -14,8 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
 from hector_jax import qp
 from hector_jax.control import gait
@@ -25,7 +21,6 @@ from hector_jax.control.footstep import Feet, feet_where
 from hector_jax.control.reference import Anchor, Command, anchor_at, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
-from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, Range, check
 from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
@@ -34,7 +29,13 @@ from hector_jax.grfm.effect import HISTORY, Effect, Window, from_yaw_frame, grou
 from hector_jax.robot import srbm
 from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.model import Robot
-from hector_jax.sim.world import ESTIMATE_NOISE
+from hector_jax.tuning.variation import (
+    Variation,
+    estimate_error,
+    moved_by,
+    noise_and_delay,
+    within_friction,
+)
 
 
 @dataclass(frozen=True)
@@ -73,66 +74,6 @@ def rollout_config(robot: Robot, ticks: int = RolloutConfig.ticks) -> RolloutCon
         raise InputError(f"{robot.description.path}: tuning: {error}") from None
 
 
-_ESTIMATED = ("angle", "position", "ang_velocity", "velocity")  # names of the fields of a State
-
-
-class Variation(NamedTuple):
-    """Difference of the world from the controller's model; see `no_variation`."""
-
-    mass: Float[Array, "*batch"]  # factor on the robot's mass
-    inertia: Float[Array, "*batch"]  # factor on the whole inertia matrix
-    com: Float[Array, "*batch 3"]  # true less modelled centre of mass, trunk axes [m]
-    friction: Float[Array, "*batch"]  # of the ground: bound on (|F_x| + |F_y|) / F_z, as in plants
-    delay: Float[Array, "*batch"]  # of the effects [s], at most a tick
-    noise: State  # standard deviations of the estimated base state, white from tick to tick
-    seed: Int[Array, "*batch"]  # of the noise
-
-
-def no_variation() -> Variation:
-    """Return the variation under which the world equals the controller's model."""
-    one, zero, zeros = np.asarray(1.0), np.asarray(0.0), np.zeros(3)
-    noise = State(zeros, zeros, zeros, zeros)
-    return Variation(one, one, zeros, np.asarray(1e3), zero, noise, np.asarray(0))
-
-
-def variation_of(config: RolloutConfig) -> Variation | None:
-    """Return the variation by the noise and the delay of a config; None if it has neither."""
-    if not config.estimate_noise and not config.delay:
-        return None
-    sizes = (config.estimate_noise * ESTIMATE_NOISE[name] for name in _ESTIMATED)
-    noise = State(*(np.full(3, size) for size in sizes))
-    variation = no_variation()._replace(noise=noise, delay=np.asarray(config.delay))
-    return jax.tree.map(jnp.asarray, variation)
-
-
-_SHARPNESS = 8  # of the edge of the friction pyramid
-_MASS, _INERTIA = 0.1, 0.2  # half widths of the drawn factors
-_COM = (0.024, 0.024, 0.048)  # half width of the drawn offset, as a share of the standing height
-_FRICTION = (0.8, 1.6)  # of the ground, as a share of the plan's
-_DELAY = 0.8  # ticks, the most
-
-
-def drawn_variation(config: RolloutConfig, robot: Robot, seed: int) -> Variation:
-    """Draw a variation as robots may differ, with the noise of a real robot's estimate.
-
-    Args:
-        config: its plan's friction and tick.
-        robot: its height.
-        seed: equal seeds give equal numbers, that of the noise too.
-    """
-    rng, walk = np.random.default_rng([0x7A5, seed]), config.walk
-    noise = State(*(np.full(3, ESTIMATE_NOISE[name]) for name in _ESTIMATED))
-    return Variation(
-        mass=np.asarray(rng.uniform(1.0 - _MASS, 1.0 + _MASS)),
-        inertia=np.asarray(rng.uniform(1.0 - _INERTIA, 1.0 + _INERTIA)),
-        com=float(robot.standing_height) * np.array(_COM) * rng.uniform(-1.0, 1.0, 3),
-        friction=np.asarray(walk.mpc.friction * rng.uniform(*_FRICTION)),
-        delay=np.asarray(walk.gait.tick * rng.uniform(0.0, _DELAY)),
-        noise=noise,
-        seed=np.asarray(seed),
-    )
-
-
 class Carry(NamedTuple):
     """State of the closed loop between two ticks."""
 
@@ -164,9 +105,19 @@ def command_history(command: Wrench) -> Wrench:
     return jax.tree.map(lambda w: jnp.broadcast_to(w, (HISTORY, *jnp.shape(w))), command)
 
 
-def init_carry(robot: Robot, anchor: Anchor, variation: Variation | None = None) -> Carry:
+class Scenario(NamedTuple):
+    """What a rollout walks, beside its settings and the weights."""
+
+    robot: Robot  # the body that the controller assumes
+    command: Command  # velocities
+    anchor: Anchor  # standing pose and gait tick of t = 0, see `reference.standing_anchor`
+    effect: jax.tree_util.Partial  # phi, `Window -> Effect`
+    variation: Variation | None = None  # None: the noise and the delay of the settings
+
+
+def init_carry(scenario: Scenario) -> Carry:
     """Return the carry of a robot standing at its anchor, its weight shared by all feet."""
-    zero = jnp.zeros(3)
+    robot, anchor, zero = scenario.robot, scenario.anchor, jnp.zeros(3)
     trunk = anchor.position - robot.com_offset
     local = foot_poses(robot, jnp.asarray(robot.standing_joints)).position
     share = robot.mass / len(local) * jnp.asarray(robot.gravity)
@@ -174,53 +125,8 @@ def init_carry(robot: Robot, anchor: Anchor, variation: Variation | None = None)
     state = State(zero, anchor.position, zero, zero)
     feet = Feet(trunk + local, jnp.zeros(len(local)))
     commands = command_history(standing)
-    before = None if variation is None else ground_effect(standing)
+    before = None if scenario.variation is None else ground_effect(standing)
     return Carry(state, feet, commands, anchor, NO_DISTURBANCE, jnp.asarray(False), before)
-
-
-def _estimate_error(variation: Variation, state: State, tick: Int[Array, ""]) -> State:
-    """Draw the error of the estimated base state."""
-    key = jax.random.fold_in(jax.random.key(variation.seed), tick)
-    draws = jax.random.normal(key, (4, 3), state.position.dtype)
-    return State(*(sigma * draw for sigma, draw in zip(variation.noise, draws, strict=True)))
-
-
-def _within_friction(wrench: Wrench, friction: Float[Array, ""]) -> Wrench:
-    """Scale the horizontal forces of feet smoothly into the friction pyramid."""
-    horizontal = jnp.sum(jnp.abs(wrench.force[:, :2]), axis=-1)
-    limit = friction * jnp.maximum(wrench.force[:, 2], 0.0)
-    # below 1 / use, at four fifths of the limit 0.98 and at the limit 0.92
-    use = horizontal / jnp.maximum(limit, 1e-3)
-    share = (1.0 + use**_SHARPNESS) ** (-1.0 / _SHARPNESS)
-    return wrench._replace(force=wrench.force.at[:, :2].multiply(share[:, None]))
-
-
-def _moved_by(
-    variation: Variation,
-    robot: Robot,
-    state: State,
-    now: Effect,
-    feet: Float[Array, "feet 3"],
-    before: Effect,
-    feet_before: Float[Array, "feet 3"],
-    dt: float,
-) -> State:
-    """Step the body with its variation; the delayed share acts at the last tick's feet."""
-    share = variation.delay / dt
-    mixed = jax.tree.map(lambda new, old: (1.0 - share) * new + share * old, now, before)
-    lever = share * jnp.cross(feet_before - feet, before.wrench.force)
-    wrench = mixed.wrench._replace(moment=mixed.wrench.moment + lever)
-    body = robot._replace(
-        mass=variation.mass * robot.mass, inertia=variation.inertia * jnp.asarray(robot.inertia)
-    )
-
-    def shifted(state: State, offset: Float[Array, "3"]) -> State:
-        arm = rotation_from_euler(state.euler) @ offset
-        velocity = state.velocity + jnp.cross(state.ang_velocity, arm)
-        return state._replace(position=state.position + arm, velocity=velocity)
-
-    stepped = srbm.step(body, shifted(state, variation.com), wrench, feet, dt, mixed.legs)
-    return shifted(stepped, -variation.com)
 
 
 def _estimate(
@@ -229,7 +135,7 @@ def _estimate(
     """Return the estimated state and feet, and the error of the state; None without variation."""
     if variation is None:
         return carry.state, carry.feet, None
-    error = _estimate_error(variation, carry.state, tick)
+    error = estimate_error(variation, carry.state, tick)
     # the legs measure the feet relative to the body, not to the world
     feet = carry.feet._replace(position=carry.feet.position + error.position)
     return jax.tree.map(jnp.add, carry.state, error), feet, error
@@ -242,16 +148,27 @@ def _on_real_ground(
     position = planned.touchdown.position + response.touchdown_error
     if variation is not None and error is not None:
         position = position - error.position
-        response = response._replace(wrench=_within_friction(response.wrench, variation.friction))
+        response = response._replace(wrench=within_friction(response.wrench, variation.friction))
     return response, feet_where(planned.contact, carry.feet, Feet(position, planned.touchdown.yaw))
+
+
+def _move(scenario: Scenario, carry: Carry, response: Effect, feet: Feet, dt: float) -> State:
+    """Return the state of the body after a tick of an effect at the feet."""
+    robot, variation, state = scenario.robot, scenario.variation, carry.state
+    if variation is None:
+        return srbm.step(robot, state, response.wrench, feet.position, dt, load=response.legs)
+    assert carry.before is not None  # `init_carry` starts with the effect of standing
+    now, before = (response, feet.position), (carry.before, carry.feet.position)
+    return moved_by(variation, robot, state, dt=dt, now=now, before=before)
 
 
 def _sample(
     config: RolloutConfig,
     robot: Robot,
+    *,
     before: Carry,
     after: Carry,
-    response: Effect,
+    effect: Wrench,
     planned: Plan,
     reference: State,
 ) -> Trajectory:
@@ -262,7 +179,7 @@ def _sample(
         state=after.state,
         reference=reference,
         command=planned.wrench,
-        effect=response.wrench,
+        effect=effect,
         contact=planned.contact,
         feet=after.feet.position,
         joints=jnp.asarray(robot.standing_joints),
@@ -276,20 +193,19 @@ def _sample(
 
 def step_carry(
     config: RolloutConfig,
-    robot: Robot,
+    scenario: Scenario,
     weights: Weights,
-    command: Command,
-    effect: jax.tree_util.Partial,
     carry: Carry,
     tick: Int[Array, ""],
-    variation: Variation | None = None,
+    *,
     wrench: Wrench | None = None,
 ) -> tuple[Carry, Trajectory]:
     """Walk one tick of the closed loop: plan, effect, motion.
 
     Returns the next carry and the tick's sample of the trajectory. A `wrench` takes the place of
-    the planned one.
+    the planned one. The anchor is that of the carry.
     """
+    robot, command, _, effect, variation = scenario
     walk, dt = config.walk, config.walk.gait.tick
     new_anchor = anchor_at(robot, carry.state, carry.anchor.tick)
     anchor = where(tick == new_anchor.tick, new_anchor, carry.anchor)
@@ -315,17 +231,20 @@ def step_carry(
     window = Window(turn(commands, -yaw), planned.contact, since, from_yaw_frame(carry.state))
     response = turn(effect(window), yaw)
     response, feet = _on_real_ground(carry, response, planned, error, variation)
-    if variation is None:
-        state = srbm.step(robot, carry.state, response.wrench, feet.position, dt, response.legs)
-    else:
-        assert carry.before is not None  # `init_carry` starts with the effect of standing
-        last = carry.before, carry.feet.position
-        state = _moved_by(variation, robot, carry.state, response, feet.position, *last, dt)
+    state = _move(scenario, carry, response, feet, dt)
     fallen = carry.fallen | has_fallen(state, *robot.description.limits)
     before = None if variation is None else response
     after = Carry(state, feet, commands, anchor, disturbance, fallen, before)
-    reference = reference_at(dt, command, anchor, tick + 1.0)
-    return after, _sample(config, robot, carry, after, response, planned, reference)
+    sample = _sample(
+        config,
+        robot,
+        before=carry,
+        after=after,
+        effect=response.wrench,
+        planned=planned,
+        reference=reference_at(dt, command, anchor, tick + 1.0),
+    )
+    return after, sample
 
 
 def walked_ticks(config: RolloutConfig, anchor: Anchor) -> Int[Array, " ticks"]:
@@ -333,32 +252,27 @@ def walked_ticks(config: RolloutConfig, anchor: Anchor) -> Int[Array, " ticks"]:
     return anchor.tick - config.lead + jnp.arange(config.lead + config.ticks)
 
 
-def from_start(config: RolloutConfig, samples: Trajectory) -> Trajectory:
+def without_lead(config: RolloutConfig, samples: Trajectory) -> Trajectory:
     """Cut the samples of all ticks to the trajectory from t = 0 on."""
     initial = jax.tree.map(lambda x: x[config.lead], samples.initial)
     walk = jax.tree.map(lambda x: x[config.lead :], samples)
     return walk._replace(initial=initial, period=jnp.asarray(config.walk.gait.tick))
 
 
-def rollout(
-    config: RolloutConfig,
-    robot: Robot,
-    weights: Weights,
-    command: Command,
-    anchor: Anchor,
-    effect: jax.tree_util.Partial,
-    variation: Variation | None = None,
-) -> Trajectory:
+def with_variation(config: RolloutConfig, scenario: Scenario) -> Scenario:
+    """Return a scenario with its variation, or with the noise and delay of the settings."""
+    if scenario.variation is not None or not (config.estimate_noise or config.delay):
+        return scenario
+    return scenario._replace(variation=noise_and_delay(config.estimate_noise, config.delay))
+
+
+def rollout(config: RolloutConfig, scenario: Scenario, weights: Weights) -> Trajectory:
     """Walk on the single rigid body: `lead` ticks in place from standing, then the command.
 
     Args:
         config: static settings.
-        robot: the body.
+        scenario: robot, command, start, phi and variation.
         weights: theta; the gradient is taken with respect to these.
-        command: commanded velocities.
-        anchor: standing pose and gait tick of t = 0, see `reference.standing_anchor`.
-        effect: phi, `Window -> Effect`.
-        variation: difference from the controller's model; None: the noise and delay of `config`.
 
     Returns:
         Trajectory of T samples from t = 0. Nothing raises: check `fallen` and `residual` before
@@ -367,16 +281,14 @@ def rollout(
     Source: Eq. 12, 13.
     """
     policy = jax.checkpoint_policies.save_only_these_names(qp.SAVED)
-    variation = variation_of(config) if variation is None else variation
-    first, ticks = init_carry(robot, anchor, variation), walked_ticks(config, anchor)
+    scenario = with_variation(config, scenario)
+    first, ticks = init_carry(scenario), walked_ticks(config, scenario.anchor)
 
     # A GPU copies one array of all numbers in a tick faster than many small ones. How to unpack a
     # sample is known only while a tick is traced: the scan returns it as a tree without arrays.
     def tick(packed: jax.Array, number: Int[Array, ""]) -> tuple:
         carry = unpack(layout(first), packed)
-        after, sample = step_carry(
-            config, robot, weights, command, effect, carry, number, variation
-        )
+        after, sample = step_carry(config, scenario, weights, carry, number)
         assert layout(after) == layout(first)
         return pack(after), (pack(sample), jax.tree_util.Partial(partial(unpack, layout(sample))))
 
@@ -391,4 +303,4 @@ def rollout(
         padded = ticks[0] + jnp.arange(blocks * size).reshape(blocks, size)
         _, (samples, to_samples) = jax.lax.scan(jax.checkpoint(walk), start, padded)
         samples = samples.reshape(-1, samples.shape[-1])[: len(ticks)]
-    return from_start(config, to_samples(samples))
+    return without_lead(config, to_samples(samples))

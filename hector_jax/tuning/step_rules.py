@@ -125,7 +125,7 @@ def trust_region(ridge: float) -> optax.GradientTransformationExtraArgs:
         size = jnp.where(accepted, size, length / 8.0)
         misses = jnp.where((ratio < POOR) | (ratio > OPTIMISTIC), state.misses + 1, 0)
         counts = begun & finite  # a fall says nothing of the prediction
-        kept = _keep(state, accepted, params, value, updates, matrix)
+        kept = _keep(state, accepted, steps=params, value=value, gradient=updates, matrix=matrix)
         kept = kept._replace(size=jnp.where(begun, size, state.size))
         kept = kept._replace(misses=jnp.where(counts, misses, state.misses))
         return kept.steps + _trusted_step(ridge, kept) - params, kept
@@ -136,6 +136,7 @@ def trust_region(ridge: float) -> optax.GradientTransformationExtraArgs:
 def _keep(
     state: StepState,
     accepted: Array,
+    *,
     steps: Float[Array, " n"],
     value: Float[Array, ""],
     gradient: Float[Array, " n"],
@@ -206,7 +207,10 @@ def _first_order(
     ) -> tuple[Float[Array, " n"], StepState]:
         accepted = jnp.isfinite(value)
         size = jnp.where(accepted, jnp.minimum(1.0, 2.0 * state.size), state.size / 2.0)
-        kept = _keep(state, accepted, params, value, updates, state.matrix)._replace(size=size)
+        matrix = state.matrix
+        kept = _keep(
+            state, accepted, steps=params, value=value, gradient=updates, matrix=matrix
+        )._replace(size=size)
         down = size * change(kept.gradient, kept.steps)
         left = jnp.maximum(1.0 - down, jnp.finfo(down.dtype).tiny)  # the box takes it from there
         return kept.steps + jnp.where(logs, jnp.log(left), -down) - params, kept

@@ -23,10 +23,10 @@ from hector_jax.report.motion import Motion
 from hector_jax.report.plots import style
 from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, label_of, looks_of
 from hector_jax.report.report import caption
-from hector_jax.runs.matrix import Cells, Column, columns_of, sets_of, trajectories_of
-from hector_jax.runs.metrics import BASELINES, Verdict, compare
 from hector_jax.tuning.difftune import Iteration
 from hector_jax.tuning.loss import Loss
+from hector_jax.verdict.matrix import Cells, Column, columns_of, sets_of, trajectories_of
+from hector_jax.verdict.metrics import BASELINES, Verdict, compare
 
 
 def tracking(path: Path, walks: Mapping[str, Trajectory]) -> str:

@@ -27,8 +27,6 @@ SETS = {
     "without": {"color": ORANGE, "linestyle": (0, (4, 1.2, 1, 1.2))},
     "with": {"color": GREEN, "linestyle": "-"},
     "best": {"color": "#1f2f8f", "linestyle": "-"},
-    "search_200": {"color": "#a566c7", "linestyle": (0, (1.2, 1.2))},
-    "with_walks": {"color": "#00805f", "linestyle": (0, (3, 1))},
     "shared_mean": {"color": "#b0186a", "linestyle": (0, (8, 1.5))},
     "shared_worst": {"color": "#d670a5", "linestyle": (0, (8, 1.5, 1, 1.5, 1, 1.5))},
     "search_2000": {"color": "#5c3a1e", "linestyle": (0, (8, 1.5, 1, 1.5))},

@@ -1,0 +1,259 @@
+"""Export for the robot: the weights with their schema, and the controller as a compiled function.
+
+A recorded walk with the outputs of the live controller lies beside the file; nothing is written
+unless the exported function returns the same outputs (`TOLERANCE`).
+"""
+
+import hashlib
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hector_jax.control.contact import LINE_FRICTION
+from hector_jax.control.controller import WalkConfig
+from hector_jax.control.mpc import input_weights
+from hector_jax.control.parameters import TUNABLES
+from hector_jax.control.reference import Command
+from hector_jax.control.weights import Weights, nominal
+from hector_jax.control.weights_file import WEIGHTS, save_weights, weights_tree
+from hector_jax.core.console import Broken
+from hector_jax.core.environment import versions
+from hector_jax.core.files import make_folder, write_file, write_json
+from hector_jax.core.inputs import InputError, plural, unknown
+from hector_jax.core.settings import Range, from_table, read_json, to_table
+from hector_jax.core.tree_file import tree_hash
+from hector_jax.export.controller import (
+    Check,
+    as_arrays,
+    compare_with_live,
+    controller,
+    export_controller,
+    load_controller,
+    record,
+    signature,
+)
+from hector_jax.robot.model import Robot
+from hector_jax.sim.loop import substeps
+from hector_jax.store.folder import CONFIG
+
+SCHEMA = "weights.schema.json"
+PLATFORMS = ("cpu", "cuda")
+TOLERANCE = 1e-6
+"""Largest difference [N, N m] from the live controller."""
+
+_DESCRIPTIONS = {
+    "Q": "of the squared error of each state, world frame",
+    "euler": "roll, pitch, yaw [1/rad^2]",
+    "position": "x, y, z of the centre of mass [1/m^2]",
+    "ang_velocity": "x, y, z [s^2/rad^2]",
+    "velocity": "x, y, z [s^2/m^2]",
+    "R": "of the squared wrench of the ground on each foot, left ones first, world frame",
+    "force": "x, y, z [1/N^2]",
+    "moment": "x, y, z [1/(N m)^2]",
+}
+_STATES = ("roll, pitch, yaw", "x, y, z", "their rates: wx, wy, wz", "vx, vy, vz")
+_INPUTS = ("force, foot 0 (left)", "force, foot 1 (right)", "moment, foot 0", "moment, foot 1")
+
+
+def find_weights(run: Path, name: str) -> tuple[Path, WalkConfig | None]:
+    """Find the file of a weight set and the controller that it was tuned for.
+
+    Args:
+        run: folder of a run, or a weights file.
+        name: name of the set in the folder.
+
+    Returns:
+        The file, and the controller; None for a weights file, which does not name its controller.
+
+    Raises:
+        InputError: one line with what is missing or wrong, and the available sets.
+    """
+    if not run.is_dir():
+        return run, None
+    sets = sorted(path.stem for path in (run / "weights").glob("*.json"))
+    if name not in sets:
+        raise InputError(f"{run}: {unknown('weight set', name, sets)}")
+    path = run / CONFIG
+    config = read_json(path, "the settings of a run")
+    try:
+        table = config["tune"]["rollout"]["walk"]
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path}: not the settings of a walking controller: {error!r}") from error
+    # a setting that this version does not know is refused: the file goes to a robot
+    walk_config = from_table(f"{path}: tune.rollout.walk", WalkConfig, table)
+    return run / "weights" / f"{name}.json", walk_config
+
+
+def _constants(config: WalkConfig, robot: Robot, lead: int) -> dict[str, Any]:
+    """Return numbers that the code of the robot needs."""
+    return {
+        "milliseconds_per_plan": substeps(config),
+        "millisecond_of_tick_0": lead,
+        "joint_names": list(robot.description.joints),
+        "standing_joints": robot.standing_joints.tolist(),
+        "standing_height": float(robot.standing_height),
+        "com_offset": robot.com_offset.tolist(),
+        "torque_limit": robot.torque_limit.tolist(),
+    }
+
+
+def _require_same(result: Check) -> None:
+    """Raise `Broken` if the exported controller differs from the live one or fails to solve."""
+    if not max(result[:3]) <= TOLERANCE:
+        raise Broken(
+            f"the exported controller differs from the live one by {result.force:.1e} N, "
+            f"{result.moment:.1e} N m and {result.torque:.1e} N m at the joints, at most "
+            f"{TOLERANCE:g} was expected; nothing was written"
+        )
+    if result.unsolved:
+        what = plural(result.unsolved, "QP") + (" was" if result.unsolved == 1 else " were")
+        raise Broken(f"{what} not solved on the walk of the check; nothing was written")
+
+
+def export(
+    config: WalkConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    folder: Path,
+    *,
+    name: str,
+    seconds: float = 1.0,
+) -> dict[str, Any]:
+    """Write everything that goes to the robot, replacing existing files.
+
+    Args:
+        config, robot, weights: the controller, its robot and the weights to export.
+        command, seconds: command and length of the walk of the check, from t = 0 on.
+        folder: folder to write.
+        name: name of the weights, for the files.
+
+    Returns:
+        The card, also in `controller.json`: sha256 of the files, signature, constants, weights,
+        settings and the check.
+
+    Raises:
+        InputError: see `record` and `export_controller`; or the folder cannot be written.
+        Broken: the exported controller differs from the live one by more than TOLERANCE, or a QP
+            of the check was not solved; nothing is written.
+    """
+    make_folder(folder)
+    blobs = {p: export_controller(config, robot, weights, platform=p) for p in PLATFORMS}
+    recorded = record(config, robot, weights, command=command, seconds=seconds)
+    _, example = controller(config, robot, weights)
+    result = compare_with_live(config, load_controller(blobs["cpu"]), example, recorded)
+    _require_same(result)
+    # the card has the hashes of the other files: it is removed first and written last
+    (folder / "controller.json").unlink(missing_ok=True)
+    save_weights(folder / "weights.json", weights, SCHEMA)
+    write_json(folder / SCHEMA, weights_schema(robot))
+    np.savez(archive := io.BytesIO(), **as_arrays(recorded))
+    contents = {f"controller-{platform}.jaxexport": blob for platform, blob in blobs.items()}
+    if len(robot.foot_point) == 2:  # the C++ controller is for bipeds
+        contents["weights.cpp"] = weights_cpp(weights, config, robot, name=name).encode()
+    contents["check.npz"] = archive.getvalue()
+    for file, content in contents.items():
+        write_file(folder / file, content)
+    files = (*contents, "weights.json", SCHEMA)
+    card = {
+        "name": name,
+        "sha256": {f: hashlib.sha256((folder / f).read_bytes()).hexdigest() for f in files},
+        "signature": signature(example),
+        "constants": _constants(config, robot, recorded.lead),
+        "weights": weights_tree(weights),
+        "controller": to_table(config),
+        "robot": tree_hash(robot),
+        "versions": versions(),
+        "check": {"milliseconds": len(recorded.torque), **result._asdict()},
+    }
+    write_json(folder / "controller.json", card)
+    return card
+
+
+def weights_schema(robot: Robot | None = None) -> dict[str, Any]:
+    """Return the JSON schema (draft 2020-12) of a weights file of a robot, HECTOR by default."""
+    schema = _schema(weights_tree(nominal(robot)))
+    others = {
+        name: _schema(np.zeros(number.shape(robot)).tolist(), Range(number.lower, number.upper))
+        for name, number in TUNABLES.items()
+    }
+    schema["properties"] |= {
+        "$schema": {"type": "string"},
+        "others": {"type": "object", "properties": others, "additionalProperties": False},
+    }
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "Weights of the walking MPC: diagonals of |x - x_ref|^2_Q + |u|^2_R",
+        **schema,
+    }
+
+
+def _schema(example: Any, range: Range = WEIGHTS) -> dict[str, Any]:
+    """Return the schema of values in a range with the nesting of an example."""
+    if isinstance(example, dict):
+        properties = {
+            name: {"description": _DESCRIPTIONS[name], **_schema(value)}
+            for name, value in example.items()
+        }
+        names = {"properties": properties, "required": list(example)}
+        return {"type": "object", **names, "additionalProperties": False}
+    if isinstance(example, list):
+        size = {"minItems": len(example), "maxItems": len(example)}
+        return {"type": "array", "items": _schema(example[0], range), **size}
+    return {"type": "number", "minimum": range.low, "maximum": range.high}
+
+
+_HEADER = """\
+// Weights {name!r}, tuned with hector_jax, for DRCL-USC/Hector_Simulation, branch
+// ROS_Simulation: these take the place of Q and Alpha in updateMPCIfNeeded() of
+// hector_control/ConvexMPC/ConvexMPCLocomotion.cpp.
+//
+// Both controllers minimise sum |x - x_ref|^2_Q + |u|^2_Alpha, world frame, in SI; the numbers go
+// over as they are. They were tuned with {mass:.4g} kg, steps of {dt:g} s, {horizon} of them,
+// |F_x| + |F_y| <= {mu:g} F_z <= {limit:g} N, -{toe:.3g} F_z <= M_y <= {heel:.3g} F_z, M_x = 0,
+// friction at toe and heel: {line}. What differs in the C++ controller is in docs/export-cpp.md
+// of hector_jax: read it before walking.
+"""
+_ATTENTION = """\
+// ATTENTION: R prices u less the feet's share of the weight here, u itself there: Alpha was not
+// tuned for that.
+"""
+
+
+def weights_cpp(weights: Weights, config: WalkConfig, robot: Robot, *, name: str) -> str:
+    """Return the weights as the two arrays of the open HECTOR C++ controller.
+
+    Args:
+        weights: weights to write.
+        config: controller that they were tuned for.
+        robot: robot of the controller.
+        name: name of the weights, for the first line.
+
+    Source: DRCL-USC/Hector_Simulation, branch ROS_Simulation, ConvexMPCLocomotion.cpp and
+        SolverMPC.cpp at commit 79d545a, read for order and factors.
+    """
+    mpc, numbers = config.mpc, config.parameters(weights).mpc
+    header = _HEADER.format(
+        name=name,
+        mass=float(robot.mass),
+        dt=config.mpc_step,
+        horizon=mpc.horizon,
+        mu=float(numbers.friction),
+        limit=float(numbers.friction * numbers.max_force),
+        toe=float(robot.toe),
+        heel=float(robot.heel),
+        line=LINE_FRICTION in mpc.on("inputs"),
+    )
+    others = weights_tree(weights).get("others", {}).items()
+    notes = [f"// ATTENTION: walks with {name} {value}.\n" for name, value in others]
+    Q = _cpp_array("Q", np.concatenate(weights.Q), _STATES)
+    Alpha = _cpp_array("Alpha", input_weights(weights), _INPUTS)
+    return "".join([header, _ATTENTION * bool(numbers.effort_reference), *notes, Q, Alpha])
+
+
+def _cpp_array(variable: str, values: Any, names: tuple[str, ...]) -> str:
+    rows = zip(np.asarray(values, float).reshape(4, 3).tolist(), names, strict=True)
+    lines = [f"    {', '.join(map(repr, row))},  // {name}\n" for row, name in rows]
+    return "".join([f"double {variable}[12] = {{\n", *lines, "};\n"])

@@ -1,0 +1,284 @@
+"""Propose the TOML of a model's file: the names that `survey` finds, and settings by rules.
+
+Rules scale HECTOR (m0 = 12 kg; h0 = 0.423 m, the height of its centre of mass standing) to a robot
+of mass m and height h:
+
+    armature                 2e-4 kg m^2 per N m of torque limit for joints that have no armature
+    stance, swing [ticks]    20 sqrt(h / h0): a pendulum's time
+    step_ticks               0.15 swing, rounded up, at least 3: ten MPC steps reach past one swing
+    max_force                2.5 m g
+    effort_reference         "gravity": otherwise the plan jumps before single stance
+    sole_width               0.6 of a flat foot's: otherwise it rolls over its edge
+    pattern                  "trot" for four feet
+    width                    0.85 (four feet: 0.7) of half the distance of the foot points, standing
+    feedback                 0.12 s sqrt(h / h0)
+    height                   0.06 m h / 0.69 m for the swing foot; landing -0.005 m
+    kp                       I w^2 with I the inertia at the joint with its motor and w the largest
+                             with which slow motors leave the joints a phase margin of 20 degrees
+                             (`response`); at most 2 / rad times the torque limit
+    kd                       sqrt(kp I)
+    inertia_share            that share which leaves the plan's attitude the same phase margin
+    Q                        HECTOR's
+    R of forces, moments     times (m0 / m)^2, (m0 h0 / (m h))^2; for nominal times 0.3 as well
+    L_ctrl                   times (m0 / m)^2
+    lead                     one gait cycle in place before the command of a rollout
+    touchdown_error          true: heavy legs miss the planned touchdown by some centimetres
+    estimate_noise, delay    1, 0.005 s: without them a tuning takes gains that shake the robot
+    choice_plants            4: tuning can improve the model's walk and worsen the robot's
+    joint_friction, _damping times m h / (m0 h0); push, payload: m / m0; trunk_com: h / h0
+    min_height               0.55 h
+"""
+
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import from_table, read_toml
+from hector_jax.core.trajectory import FEET
+from hector_jax.importing.soles import Sole, find_soles
+from hector_jax.importing.stand import standing_pose
+from hector_jax.importing.survey import Survey, survey_file
+from hector_jax.robot.description import MAX_BYTES, Description, Joints, description_of
+from hector_jax.robot.model import Robot, build_model, quiet_mujoco, robot_of
+from hector_jax.robot.response import (
+    Response,
+    planned_inertia,
+    response,
+    swing_frequency,
+    trunk_gain,
+)
+
+MASS, HEIGHT = 12.0, 0.423  # of HECTOR [kg], [m]
+_TICK = 0.01  # [s] of the gait
+_ANGLE, _RATE = 50.0, 1.0  # weights Q of attitude and angular velocity
+_KP_PER_LIMIT = 2.0  # [1/rad]
+_NAMES = ("name", "model", "standing", "joints", "feet")  # what is found, not ruled
+_ARMATURE_PER_LIMIT = 2e-4  # [s^2]: HECTOR's has 2.4e-4, Unitree's robots 1e-4 to 4e-4
+
+
+class RobotProposal(NamedTuple):
+    """The proposed TOML of a file, as far as its rules go."""
+
+    table: dict[str, Any]
+    wrong: tuple[str, ...]  # one line per problem to correct by hand
+    filled: list[str]  # keys that the file does not have, which are proposed
+    survey: Survey | None = None  # None: the file names all, or it has no legs
+    soles: tuple[Sole, ...] = ()
+    robot: Robot | None = None  # None: it cannot be built
+    error: str | None = None  # why the robot cannot be used
+
+
+@quiet_mujoco()
+def propose_robot(path: Path) -> RobotProposal:
+    """Return the proposed TOML of a model's file, or of a TOML file with what it leaves out.
+
+    Raises:
+        InputError: one line with the wrong part of the TOML file.
+    """
+    path = Path(path)
+    own: dict[str, Any] = {"model": path.name}
+    if path.suffix == ".toml":
+        own = read_toml(path, "the robot description", MAX_BYTES)
+        if not isinstance(own.get("model"), str):
+            description_of(path, own)  # refuses it
+    wrong, error = [], None
+    stem = "".join(x if x.isalnum() or x in "-_" else "-" for x in path.stem)
+    found = RobotProposal({"name": stem, **own}, (), [])
+    try:
+        named = _named_legs(path, own)
+        if not (named and "feet" in own and "standing" in own):
+            found = _with_legs(survey_file(path.with_name(own["model"]), named), found)
+            found = _with_feet(found, wrong)
+        names = {key: found.table[key] for key in _NAMES if key in found.table}
+        description = description_of(path.with_suffix(".toml"), names)
+        if armature := _armature(description):
+            names["joints"] = _merged({"armature": armature}, names["joints"])
+            description = description_of(description.path, names)
+        robot = robot_of(description, checked=False)
+        table = _merged(_settings(robot), found.table | names)
+        description = description_of(description.path, table)
+        found = found._replace(table=table, robot=robot._replace(description=description))
+        robot_of(description)
+    except InputError as raised:
+        error = str(raised)
+        wrong.append(error)
+    return found._replace(wrong=tuple(wrong), filled=_left_out(found.table, own), error=error)
+
+
+def standard_form(proposal: RobotProposal, model: str) -> tuple[dict[str, Any], str]:
+    """Return TOML table and MJCF of a proposed robot in the standard form, which has all names.
+
+    Args:
+        proposal: of a robot that can be used.
+        model: name of the file of the MJCF.
+    """
+    assert proposal.robot is not None
+    description, table = proposal.robot.description, proposal.table
+    joints = {key: x for key, x in table["joints"].items() if key not in ("weld", "armature")}
+    feet = {
+        leg: {"point": foot.point, "contacts": list(foot.contacts)}
+        for leg, foot in zip(description.legs, description.named_feet, strict=True)
+    }
+    named = {"standing": description.standing_key, "joints": joints, "feet": feet}
+    return table | {"model": model} | named, build_model(description)[0].to_xml()
+
+
+def _named_legs(path: Path, own: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Return the joints of each leg that a TOML file names; none if they are to be found."""
+    joints = own.get("joints", {})
+    if isinstance(joints, dict) and not {*joints} & {*sum(FEET.values(), ())}:
+        return []
+    return list(from_table(f"{path}: joints", Joints, joints).legs.values())
+
+
+def _with_legs(survey: Survey, found: RobotProposal) -> RobotProposal:
+    """Return a proposal with the legs of a survey; what its table has stays."""
+    legs = zip(FEET[len(survey.legs)], survey.legs, strict=True)
+    joints: dict[str, Any] = {x: [survey.model.joint(j).name for j in leg] for x, leg in legs}
+    joints |= {"weld": list(survey.weld)} if survey.weld else {}
+    return found._replace(survey=survey, table=_merged({"joints": joints}, found.table))
+
+
+def _with_feet(found: RobotProposal, wrong: list[str]) -> RobotProposal:
+    """Return a proposal with feet and standing angles; what its table has stays."""
+    survey = found.survey
+    assert survey is not None
+    soles = find_soles(survey)
+    angles, balanced = standing_pose(survey, soles)
+    if len(soles[0].contacts) == 1:  # a round foot, whose contact moves when the leg bends
+        soles = find_soles(survey, angles)
+        angles, balanced = standing_pose(survey, soles, angles)
+    if soles[0].guessed and "feet" not in found.table:
+        wrong.append(
+            f"no box, sphere, capsule or cylinder of body {soles[0].section['body']!r} collides: "
+            "its contacts are guessed from its inertia: measure the sole and correct "
+            f"{' and '.join(f'feet.{leg}' for leg in FEET[len(soles)])}"
+        )
+    if not balanced and "standing" not in found.table:
+        wrong.append(
+            "no standing pose found with level soles and the centre of mass over the feet: correct "
+            "the angles of [standing]"
+        )
+    feet = dict(zip(FEET[len(soles)], (sole.section for sole in soles), strict=True))
+    table = {"standing": angles, "joints": {}, "feet": feet} | found.table
+    return found._replace(soles=soles, table=table)
+
+
+def _merged(rules: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """Return what a table has, and what the rules say where it has nothing."""
+    both = {
+        key: _merged(value, own[key])
+        for key, value in rules.items()
+        if isinstance(value, dict) and isinstance(own.get(key), dict)
+    }
+    return {**{key: x for key, x in own.items() if key not in rules}, **rules, **own, **both}
+
+
+def _left_out(table: dict[str, Any], own: dict[str, Any], prefix: str = "") -> list[str]:
+    """Return the keys of a table that another one does not have."""
+    keys = []
+    for key, value in table.items():
+        if key not in own:
+            keys.append(f"{prefix}{key}")
+        elif isinstance(value, dict):
+            keys += _left_out(value, own[key], f"{prefix}{key}.")
+    return keys
+
+
+def _settings(robot: Robot) -> dict[str, Any]:
+    """Return the part of the TOML with the settings that follow from the rules."""
+    height, weight = float(robot.standing_height), float(robot.mass * robot.gravity[2])
+    mass, size = float(robot.mass) / MASS, height / HEIGHT  # relative to HECTOR's
+    root, torque = math.sqrt(size), _short(mass * size)
+    ticks = round(20 * root)
+    four, flat = len(robot.foot_point) == 4, robot.structure.contact == "flat"
+    step_ticks, answer = max(3, math.ceil(0.15 * ticks)), response(robot)
+    step, gain = _TICK * step_ticks, trunk_gain(robot, answer)
+    inertia = planned_inertia(gain, angle=_ANGLE, rate=_RATE, step=step, tick=_TICK)
+    aside = float(np.abs(answer.lever[:, 1]).mean())
+    return {
+        "limits": {"min_height": round(0.55 * height, 2)},
+        "gait": ({"pattern": "trot"} if four else {}) | {"stance": ticks, "swing": ticks},
+        "mpc": {
+            "step_ticks": step_ticks,
+            "max_force": float(f"{2.5 * weight:.2g}"),
+            "effort_reference": "gravity",
+            **({"sole_width": 0.6} if flat else {}),
+            "inertia_share": inertia.round(2).tolist(),
+        },
+        "footstep": {
+            "width": round((0.7 if four else 0.85) * aside, 3),
+            "feedback": round(0.12 * root, 3),
+        },
+        "legs": {
+            "height": round(0.06 * height / 0.69, 3),
+            "landing": -0.005,
+            **_gains(robot, answer),
+            "gravity_compensation": True,
+        },
+        "weights": _weights(mass, size),
+        "loss": {"L_ctrl": _short(mass**-2)},
+        "tuning": {
+            "lead": 2 * ticks,
+            "touchdown_error": True,
+            "estimate_noise": 1,
+            "delay": 0.005,
+            "choice_plants": 4,
+        },
+        "plants": {
+            "joint_friction": torque,
+            "joint_damping": torque,
+            "push": _short(mass),
+            "trunk_com": _short(size),
+            "payload": _short(mass),
+        },
+    }
+
+
+def _armature(description: Description) -> list[float] | None:
+    """Return the armature of a leg's motors [kg m^2] by the rule, None if the file has all."""
+    _, model = build_model(description, checked=False)
+    count = description.leg_joints
+    armature = model.dof_armature[6 : 6 + count]
+    default = _ARMATURE_PER_LIMIT * model.actuator_ctrlrange[:count, 1]
+    complete = np.all(armature)
+    return None if complete else [_short(x) for x in np.where(armature, armature, default)]
+
+
+def _gains(robot: Robot, answer: Response) -> dict[str, list[float]]:
+    """Return the gains of a leg's joints from the mean inertia and least torque of all legs."""
+    legs = len(robot.foot_point)
+    inertia = answer.inertia.reshape(legs, -1).mean(axis=0)
+    limit = robot.torque_limit.reshape(legs, -1).min(axis=0)
+    kp = np.minimum(inertia * swing_frequency(answer) ** 2, _KP_PER_LIMIT * limit)
+    return {"kp": [_short(x) for x in kp], "kd": [_short(x) for x in np.sqrt(kp * inertia)]}
+
+
+def _weights(mass: float, size: float) -> dict[str, Any]:
+    """Return HECTOR's Q, and R scaled by the squares of mass and of mass times size."""
+    force, moment = mass**-2, (mass * size) ** -2
+    rates = {"ang_velocity": _RATE, "velocity": 1}
+    return {
+        "nominal": {
+            "euler": _ANGLE,
+            "position": [50, 50, 250],
+            **rates,
+            "force": _short(0.3e-4 * force),
+            "moment": _short(0.3e-3 * moment),
+        },
+        "expert": {
+            "euler": [100, 100, 250],
+            "position": [200, 200, 300],
+            **rates,
+            "force": [_short(x * force) for x in (1e-4, 1e-4, 5e-4)],
+            "moment": _short(1e-2 * moment),
+        },
+    }
+
+
+def _short(x: float) -> float:
+    """Return a number rounded to three digits."""
+    return float(f"{x:.3g}")

@@ -1,1 +1,0 @@
-"""Steps of a run, and the artefacts that they store and read again."""

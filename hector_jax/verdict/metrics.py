@@ -1,0 +1,293 @@
+"""Comparison of weight sets and its uncertainty: scores of walks, paired over plants and scenes.
+
+Each walk has a `Score`. A `Verdict` holds those of all sets on the same plants (one per seed) and
+in the same scenes (trajectories). The main result is the median over all walks of the ratio of the
+losses of two sets on the same plant and scene, as a change in %; means are given beside it.
+
+Plants are the sample: walks of one plant are not independent. Intervals are percentile bootstraps
+that redraw plants, each with all its scenes and the walks of both sets. With fewer than four plants
+there is no interval.
+
+A fall stays in the numbers with the charge of the loss. A comparison counts only if neither set
+falls more often than the other by 2 of 32 walks or the same share.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+
+from hector_jax.core.trajectory import Trajectory
+from hector_jax.core.tree import stack
+from hector_jax.tuning.loss import PAPER_LOSS, Loss, alphas, losses, switch_loss, total
+
+BASELINES = ("nominal", "expert")
+
+COVERAGE = 0.95  # of an interval
+RESAMPLES, FEWEST = 10_000, 4  # resamples of a bootstrap; fewest samples for an interval
+FALL_MARGIN = 2 / 32  # from this difference in the share of falls on, losses are not comparable
+
+_TINY = 1e-9
+
+
+class Score(NamedTuple):
+    """Losses and errors of one walk or, with leading axes, of several."""
+
+    losses: dict[str, Float[np.ndarray, "*walks"]]  # L, and its unweighted terms
+    switching: Float[np.ndarray, "*walks"]  # the share of L_ctrl due to changes of stance
+    rms_euler: Float[np.ndarray, "*walks 3"]  # roll, pitch, yaw [rad], up to a fall
+    rms_position: Float[np.ndarray, "*walks 3"]  # x, y, z [m], up to a fall
+    fallen: Bool[np.ndarray, "*walks"]
+    legs_touch: Float[np.ndarray, "*walks"]  # [s] of contact between the legs, up to a fall
+    residual: Float[np.ndarray, "*walks"]  # largest relative KKT residual of a plan
+
+    @property
+    def L(self) -> Float[np.ndarray, "*walks"]:  # noqa: D102, N802
+        return self.losses["L"]
+
+
+def percent(x: float) -> str:
+    """Format a change in %, with two digits."""
+    return f"{x:+.1f}" if abs(x) < 9.95 else f"{x:+.0f}"
+
+
+class Interval(NamedTuple):
+    """A value with the ends of its 95 % bootstrap interval, NaN if there is none."""
+
+    value: float
+    low: float
+    high: float
+
+    def text(self, write: Callable[[float], str] = percent) -> str:
+        """Format as `value [low, high]` with `write`; without an interval the value alone."""
+        ends = f" [{write(self.low)}, {write(self.high)}]" if np.isfinite(self.low) else ""
+        return write(self.value) + ends
+
+
+class Comparison(NamedTuple):
+    """Comparison of two sets on the same plants and scenes."""
+
+    change: dict[str, Interval]  # by part: median of the paired ratio, as a change in %
+    wins: float  # share of walks in which the first set has the lower L
+    counts: bool  # neither set falls so much more often that losses are not comparable
+
+
+class Verdict(NamedTuple):
+    """Scores of all sets on the same plants of one world, in the same scenes."""
+
+    seeds: Int[np.ndarray, " plants"]
+    scenes: tuple[str, ...]  # names of the trajectories
+    scores: dict[str, Score]  # by set, (plants, scenes) each
+    loss: Loss
+
+    @property
+    def walks(self) -> int:
+        """Number of walks of each set."""
+        return len(self.seeds) * len(self.scenes)
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the terms of the loss, and of their sum."""
+        return (*(term.name for term in self.loss), "L")
+
+
+class Summary(NamedTuple):
+    """Results of one set of a verdict."""
+
+    means: dict[str, Interval]  # over plants and scenes, by part
+    falls: int  # walks in which it falls
+    against: dict[str, Comparison]  # by the other set
+
+
+def score(loss: Loss, walk: Trajectory) -> Score:
+    """Compute losses, falls and tracking errors of one walk in any world.
+
+    Args:
+        loss: terms and weights.
+        walk: trajectory without batch axes.
+
+    Source: Eq. 11.
+    """
+    terms = losses(loss, walk)
+    fallen = np.asarray(walk.fallen)
+    named = {**terms, "L": total(loss, terms)}
+    return Score(
+        losses={part: np.asarray(value, float) for part, value in named.items()},
+        switching=np.asarray(switch_loss(walk), float),
+        rms_euler=_rms(np.asarray(walk.state.euler) - walk.reference.euler, ~fallen),
+        rms_position=_rms(np.asarray(walk.state.position) - walk.reference.position, ~fallen),
+        fallen=np.asarray(fallen.any()),
+        legs_touch=np.asarray(float(walk.period) * np.sum(np.asarray(walk.legs_touch) & ~fallen)),
+        residual=np.asarray(walk.residual, float).max(),
+    )
+
+
+def score_like(*axes: int, loss: Loss = PAPER_LOSS) -> Score:
+    """Return a score of zeros with given leading axes, for `load_tree`."""
+    zero, vector = np.zeros(axes), np.zeros((*axes, 3))
+    parts = dict.fromkeys((*(term.name for term in loss), "L"), zero)
+    return Score(parts, zero, vector, vector, zero.astype(bool), zero, zero)
+
+
+def _rms(error: Float[np.ndarray, "*n 3"], rows: Bool[np.ndarray, "*n"]) -> Float[np.ndarray, "3"]:
+    """Return the root mean square over some rows; NaN without rows."""
+    return np.sqrt(np.mean(error[rows] ** 2, axis=0)) if rows.any() else np.full(3, np.nan)
+
+
+def make_verdict(
+    loss: Loss, seeds: Sequence[int], scores: Mapping[str, Mapping[str, Sequence[Score]]]
+) -> Verdict:
+    """Combine the walks of all sets into a verdict.
+
+    Args:
+        loss: loss of the scores.
+        seeds: seeds of the plants, in the order of the scores.
+        scores: scores by scene and set, one per seed; all scenes have the same sets.
+
+    Raises:
+        ValueError: there are no seeds, or a set has another number of walks or a loss that is not
+            finite.
+    """
+    if not len(seeds):
+        raise ValueError("a verdict needs at least one seed, got none")
+    stacked = {}
+    for name in next(iter(scores.values())):
+        by_scene = [sets[name] for sets in scores.values()]
+        by_plant = zip(seeds, *by_scene, strict=True)
+        stacked[name] = stack([stack(walks) for _, *walks in by_plant])
+        if wrong := np.asarray(seeds)[~np.isfinite(stacked[name].L).all(axis=1)].tolist():
+            raise ValueError(f"set '{name}': the loss on seeds {wrong} is not a finite number")
+    return Verdict(np.asarray(seeds, int), tuple(scores), stacked, loss)
+
+
+def bootstrap(statistic: Callable[..., Any], *samples: Shaped[np.ndarray, "n ..."]) -> Interval:
+    """Compute a statistic with its percentile bootstrap interval, reproducibly.
+
+    Args:
+        statistic: function of arrays like `samples`, possibly with leading axes.
+        samples: arrays to resample along their first axis, all with the same rows.
+
+    Returns:
+        The value and the interval, whose ends are NaN for fewer than `FEWEST` samples.
+
+    >>> interval = bootstrap(lambda x: np.median(x, axis=-1), np.array([1.0, 2.0, 3.0, 10.0]))
+    >>> interval.low <= interval.value == 2.5 <= interval.high
+    True
+    """
+    value, count = float(statistic(*samples)), len(samples[0])
+    if count < FEWEST:
+        return Interval(value, np.nan, np.nan)
+    from scipy import stats  # takes most of a second to import
+
+    ends = stats.bootstrap(
+        (np.arange(count),),  # rows, so that all arrays are resampled in the same way
+        lambda rows, axis: statistic(*(x[rows] for x in samples)),
+        n_resamples=RESAMPLES,
+        confidence_level=COVERAGE,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    return Interval(value, float(ends.low), float(ends.high))
+
+
+@lru_cache(maxsize=4096)  # table, report and JSON need the same intervals
+def _cached_bootstrap(values: bytes, plants: int, statistic: Callable[..., Any]) -> Interval:
+    by_plant = np.frombuffer(values).reshape(plants, -1)
+    return bootstrap(partial(statistic, axis=(-2, -1)), by_plant)
+
+
+def mean(verdict: Verdict, name: str, part: str = "L") -> Interval:
+    """Return the mean over plants and scenes of a part of the loss."""
+    losses = verdict.scores[name].losses[part]
+    return _cached_bootstrap(losses.tobytes(), len(losses), np.mean)
+
+
+def falls_comparable(first: Bool[np.ndarray, "*walks"], second: Bool[np.ndarray, "*walks"]) -> bool:
+    """Tell whether the shares of falls of two sets are close enough to compare their losses."""
+    return bool(abs(first.mean() - second.mean()) < FALL_MARGIN - 1e-12)
+
+
+def compare(verdict: Verdict, name: str, baseline: str) -> Comparison:
+    """Compare a set with a baseline, walk by walk."""
+    score, base = verdict.scores[name], verdict.scores[baseline]
+    change = {}
+    for part in verdict.parts:
+        # a walk that falls at once has no L_ctrl: keep its ratio finite
+        ratio = (score.losses[part] + _TINY) / (base.losses[part] + _TINY)
+        median = _cached_bootstrap(ratio.tobytes(), len(ratio), np.median)
+        change[part] = Interval(*(100.0 * (r - 1.0) for r in median))
+    wins = float(np.mean(score.L < base.L))
+    return Comparison(change, wins, falls_comparable(score.fallen, base.fallen))
+
+
+def summarize(verdict: Verdict, name: str, others: Sequence[str] = BASELINES) -> Summary:
+    """Return means and falls of a set and its comparison with those `others` in the verdict."""
+    against = [other for other in others if other in verdict.scores and other != name]
+    return Summary(
+        {part: mean(verdict, name, part) for part in verdict.parts},
+        int(verdict.scores[name].fallen.sum()),
+        {other: compare(verdict, name, other) for other in against},
+    )
+
+
+def family_of(world: str) -> str | None:
+    """Return the family of plants of a world of the stand-in; None for another world.
+
+    >>> family_of("standin"), family_of("standin-even"), family_of("hfs")
+    ('standin', 'even', None)
+    """
+    name, _, family = world.partition("-")
+    return (family or name) if name == "standin" else None
+
+
+def verdict_result(verdict: Verdict, world: str = "standin") -> dict[str, Any]:
+    """Return the verdict as JSON values: the content of result.json.
+
+    `family` is that of the plants; results without this key are of the family `standin`.
+    `sets.<name>.<world>.<part>.{mean,low,high}`, `.falls` of walks, `.seeds` of the plants,
+    `.scenes`, `.legs_touch` [s, all walks together], `.L_ctrl_switching` and `.rms`, and
+    `sets.<name>.<world>.change.<baseline>.{median,low,high,wins,counts}` in %, of L, with those of
+    the other parts under `.parts`.
+    """
+    return {
+        "alpha": alphas(verdict.loss),
+        "family": family_of(world),
+        "sets": {name: {world: _set_result(verdict, name)} for name in verdict.scores},
+    }
+
+
+def _set_result(verdict: Verdict, name: str) -> dict[str, Any]:
+    scores, summary = verdict.scores[name], summarize(verdict, name)
+    euler, position = rms(verdict, name)
+    return {
+        **_intervals("mean", summary.means),
+        "falls": summary.falls,
+        "seeds": verdict.seeds.tolist(),
+        "scenes": list(verdict.scenes),
+        "legs_touch": float(scores.legs_touch.sum()),
+        "residual": float(scores.residual.max()),
+        "L_ctrl_switching": float(scores.switching.mean()),
+        "rms": {"euler": euler.tolist(), "position": position.tolist()},
+        "change": {other: change_result(row) for other, row in summary.against.items()},
+    }
+
+
+def _intervals(value: str, parts: Mapping[str, Interval]) -> dict[str, dict[str, float]]:
+    """Return intervals by part as JSON values; `value` is the key of their value."""
+    keys = value, "low", "high"
+    return {part: dict(zip(keys, interval, strict=True)) for part, interval in parts.items()}
+
+
+def change_result(comparison: Comparison) -> dict[str, Any]:
+    """Return a comparison as JSON values: the change of L, wins, counts, and that of the parts."""
+    rows = _intervals("median", comparison.change)
+    return rows.pop("L") | {"wins": comparison.wins, "counts": comparison.counts, "parts": rows}
+
+
+def rms(verdict: Verdict, name: str) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Return the RMS errors over all walks: roll, pitch, yaw [rad], and x, y, z [m]."""
+    # walks that fell at once have no errors
+    mean = lambda x: _rms(x, np.isfinite(x).all(axis=-1))  # noqa: E731
+    return mean(verdict.scores[name].rms_euler), mean(verdict.scores[name].rms_position)

@@ -1,0 +1,393 @@
+"""Tuning on few walks: a folder in which proposals and the logs of their walks alternate.
+
+Whether a simulator (`tune_on_walks`) or a real robot (`hector propose`, `hector report`) walks, the
+same functions read the logs and make the proposals (search/few_walks.py), and all that they use is
+in the folder:
+
+- `walks.jsonl`: settings, then a line for each proposal that was walked.
+- `logs/3-0.npz`: the log of walk 3 in case 0, at the plan interval, or the file that was reported.
+- `weights/3.json`, `proposals/3.json`: the weights of walk 3, and how they were proposed.
+- `metric.npz`: the Gauss-Newton matrix at the start, which defines the coordinates of all points.
+
+A weight set is walked in each case: all commands, on each plant. Its loss is the mean over the
+cases, each divided by its loss at the start, so that all count alike.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from itertools import repeat
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from hector_jax.control.parameters import steps_between
+from hector_jax.control.reference import Command, standing_anchor
+from hector_jax.control.weights import Weights, direction_names
+from hector_jax.control.weights_file import save_weights, weights_tree
+from hector_jax.core.console import bar, say
+from hector_jax.core.environment import code_hash
+from hector_jax.core.files import write_json
+from hector_jax.core.inputs import InputError, one_line, plural
+from hector_jax.core.settings import read_json
+from hector_jax.core.trajectory import no_samples
+from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
+from hector_jax.grfm import network
+from hector_jax.search import few_walks
+from hector_jax.search.cmaes import add_row, read_journal
+from hector_jax.search.few_walks import Model, Proposal, Space, WalkResult
+from hector_jax.sim.loop import Job
+from hector_jax.store import tunings
+from hector_jax.store.cache import content_key, robot_hash
+from hector_jax.store.setup import Setup
+from hector_jax.tuning.difftune import TuneConfig, step_status
+from hector_jax.tuning.evaluate import Evaluation
+from hector_jax.tuning.grounded import Grounding, evaluate_grounded, fit_grounding, grounded_matrix
+from hector_jax.tuning.rollout import Scenario
+from hector_jax.tuning.status import StepStatus
+from hector_jax.walk_tuning.campaign import (
+    Campaign,
+    box_of,
+    matrix_of,
+    slope_of,
+    walker_hash,
+    weights_at,
+)
+from hector_jax.walk_tuning.walk_log import (
+    Log,
+    ScoredLog,
+    evaluate_log,
+    log_of,
+    read_log,
+    trajectory_of,
+)
+
+RECORD = "walks.jsonl"
+
+
+class Row(NamedTuple):
+    """A proposal and the results of its walks."""
+
+    point: Float[np.ndarray, " n"]
+    method: str
+    predicted: float | None
+    losses: Float[np.ndarray, " cases"]  # infinite where the robot fell or a QP was not solved
+    margin: float  # share of the way to a fall, the largest of the cases
+
+
+# Jobs of worker processes
+
+
+def walk_case(campaign: Campaign, weights: Weights, case: int) -> ScoredLog:
+    """Walk a weight set in a case of a campaign, and score the walk."""
+    config, robot = campaign.config, campaign.robot
+    plant, command = campaign.cases[case]
+    assert plant is not None  # None: the walks are made elsewhere
+    job = Job(weights, command, plant, campaign.seconds, case)
+    walked = next(campaign.engine.walk(None, config.rollout.walk, robot, [job]))
+    log = jax.tree.map(np.asarray, log_of(walked))
+    return evaluate_log(config, robot, command, log)
+
+
+def _ground_job(campaign: Campaign, weights: Weights, command: Command, log: Log) -> Grounding:
+    """Ground the plain rigid body on a walk, unless the campaign has no use for residuals."""
+    config, robot = campaign.config.rollout, campaign.robot
+    effect = network.effect_of(None, config.walk)
+    trajectory = trajectory_of(log, config.walk.gait.tick)
+    scenario = Scenario(robot, command, standing_anchor(robot), effect)
+    grounding = fit_grounding(config, scenario, weights, trajectory)
+    if not campaign.grounded:
+        grounding = grounding._replace(residuals=jax.tree.map(jnp.zeros_like, grounding.residuals))
+    return jax.device_get(grounding)
+
+
+def _evaluate_job(config: TuneConfig, grounding: Grounding, weights: Weights) -> Evaluation:
+    return jax.device_get(evaluate_grounded(config.rollout, grounding, weights, config.loss))
+
+
+def _matrix_job(config: TuneConfig, grounding: Grounding, weights: Weights) -> Any:
+    return np.asarray(
+        grounded_matrix(config.rollout, grounding, weights, config.loss, config.others)
+    )
+
+
+def row_of(proposal: Proposal, cases: Sequence[ScoredLog]) -> Row:
+    """Return the row of a proposal and the scores of its walks."""
+    losses = np.array([score.loss for score, _ in cases])
+    return Row(*proposal, losses, max(score.margin for score, _ in cases))
+
+
+# The folder
+
+
+def campaign_space(pool: Executor, campaign: Campaign) -> Space:
+    """Return the coordinates of all points, from their file or from the model at the start.
+
+    Raises:
+        InputError: the file of the matrix is damaged, or of another robot.
+    """
+    # reported walks are of the robot's files, however this code reads them: see `walker_hash`
+    robot, path = None if campaign.reported else campaign.robot, campaign.folder / "metric.npz"
+    if not path.exists():
+        problem = tunings.Problem(tuple(campaign.commands.values()), None)
+        setup = Setup(pool, campaign.config, campaign.robot)
+        matrix = tunings.relative_matrix(setup, campaign.start, problem)
+        save_tree(path, {"matrix": matrix}, kind="metric", robot=campaign.robot)
+    tree, _ = load_tree(path, {"matrix": np.zeros((0, 0))}, kind="metric", robot=robot)
+    return few_walks.space_of(tree["matrix"], box_of(campaign))
+
+
+def read_history(campaign: Campaign) -> list[Row]:
+    """Return the walks so far; begin the record if the campaign is new.
+
+    Those that were reported are scored as they were then: see `reported_walks.read_reports`.
+
+    Raises:
+        InputError: the folder holds the record of another campaign, or a damaged one.
+    """
+    size, engine, hint = len(box_of(campaign)), campaign.engine, ""
+    head: dict[str, Any] = {
+        "format": 2,
+        "robot": robot_hash(campaign.robot),
+        "start": weights_tree(campaign.start),
+        "settings": content_key(campaign.config, campaign.start, code=()),
+        "commands": {name: tree_hash(command) for name, command in campaign.commands.items()},
+        "plants": [plant and tree_hash(plant) for plant in campaign.plants],
+        "seed": campaign.seed,
+        "leg_numbers": list(campaign.leg_numbers),
+    }
+    if campaign.reported:  # data: neither code nor loss can make them those of another campaign
+        settings = {"seconds": campaign.seconds, "numbers": list(campaign.numbers)}
+        head |= {"robot": walker_hash(campaign.robot), "settings": settings}
+        hint = f" and begin anew with hector propose --start {campaign.folder}/weights/N.json"
+    else:
+        head |= {"methods": list(campaign.methods), "grounded": campaign.grounded}
+        head |= {"engine": engine.key, "code": code_hash("walk_tuning.walks", *engine.modules)}
+
+    def parse(row: Mapping[str, Any]) -> Row:
+        point, losses = np.array(row["point"], float), np.array(row["losses"], float)
+        if (got := (point.shape, losses.shape)) != ((size,), (len(campaign.cases),)):
+            raise ValueError(f"point and losses of shapes {got}")
+        losses = np.where(np.isfinite(losses), losses, np.inf)
+        return Row(point, row["method"], row["predicted"], losses, float(row["margin"]))
+
+    path, what = campaign.folder / RECORD, "tuning on walks"
+    return read_journal(path, head, what=what, parse=parse, hint=hint)
+
+
+def _walked(rows: Sequence[Row]) -> list[WalkResult]:
+    """Return the rows with the logarithm of their mean loss over the cases relative to the start.
+
+    It is infinite if the mean loss is not finite.
+    """
+    with np.errstate(invalid="ignore"):
+        ratios = [np.mean(row.losses / rows[0].losses) for row in rows]
+    losses = [float(np.log(ratio)) if np.isfinite(ratio) else np.inf for ratio in ratios]
+    return [WalkResult(*row[:3], L, row.margin) for row, L in zip(rows, losses, strict=True)]
+
+
+def next_proposal(
+    pool: Executor, campaign: Campaign, space: Space, rows: Sequence[Row]
+) -> tuple[Proposal, Weights]:
+    """Return the next proposal, saved in the folder; it stays the same until it is walked.
+
+    Raises:
+        InputError: the start fell, the file of the proposal is damaged, or packages of the extra
+            `search` are missing.
+    """
+    if rows and not _stood(rows[0]):
+        raise InputError(
+            f"{campaign.folder}: the start fell, or a QP was not solved; tune from another"
+        )
+    if (proposal := pending(campaign, len(rows))) is not None:
+        return proposal, weights_at(campaign, space, proposal.point)
+    history = _walked(rows)
+    has_model = few_walks.needs_model(history, campaign.methods)
+    model = _model(pool, campaign, space, rows) if has_model else None
+    proposal = few_walks.propose(space, history, model, campaign.seed, methods=campaign.methods)
+    weights = weights_at(campaign, space, proposal.point)
+    save_weights(weights_path(campaign.folder, len(rows)), weights)
+    fields = {**proposal._asdict(), "point": proposal.point.tolist()}
+    write_json(proposal_path(campaign, len(rows)), fields)
+    return proposal, weights
+
+
+def pending(campaign: Campaign, number: int) -> Proposal | None:
+    """Return the proposal of the next walk, of this number, if it was made.
+
+    Raises:
+        InputError: its file is damaged.
+    """
+    if not (path := proposal_path(campaign, number)).exists():
+        return None
+    table = read_json(path, "a proposal")
+    try:
+        point = np.array(table["point"], float)
+        if point.shape != (len(box_of(campaign)),):
+            raise ValueError(f"a point of shape {point.shape}")
+        return Proposal(point, table["method"], table["predicted"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: damaged: {one_line(error)}; remove it") from None
+
+
+def proposal_path(campaign: Campaign, number: int) -> Path:
+    """Return the file of the proposal of a walk."""
+    return campaign.folder / "proposals" / f"{number}.json"
+
+
+def weights_path(folder: Path, number: int) -> Path:
+    """Return the file of the weights of a walk in the folder of a campaign."""
+    return folder / "weights" / f"{number}.json"
+
+
+def log_paths(campaign: Campaign, number: int) -> list[Path]:
+    """Return the files of the logs of a walk, one for each case."""
+    names = [f"{number}-{case}.npz" for case in range(len(campaign.cases))]
+    return [campaign.folder / "logs" / name for name in names]
+
+
+def evaluate_logs(pool: Executor, campaign: Campaign, number: int) -> list[ScoredLog]:
+    """Evaluate the logs of a walk that was reported; see `evaluate_log`."""
+    paths, commands = log_paths(campaign, number), [command for _, command in campaign.cases]
+    logs = [read_log(path, campaign.robot, campaign.seconds) for path in paths]
+    inputs = repeat(campaign.config), repeat(campaign.robot), commands, logs
+    return list(pool.map(evaluate_log, *inputs))
+
+
+def _plan_logs(pool: Executor, campaign: Campaign, number: int) -> list[Log]:
+    """Return the logs of a walk at the plan interval."""
+    if campaign.reported:
+        return [log for _, log in evaluate_logs(pool, campaign, number)]
+    like = log_of(no_samples(len(campaign.robot.joint_lower), len(campaign.robot.foot_point)))
+    paths = log_paths(campaign, number)
+    return [load_tree(path, like, kind="log", robot=campaign.robot)[0] for path in paths]
+
+
+def _model(pool: Executor, campaign: Campaign, space: Space, rows: Sequence[Row]) -> Model:
+    """Return the model grounded on the best walk, where its loss is that of the walk."""
+    best = few_walks.best_walk(_walked(rows))
+    weights = weights_at(campaign, space, rows[best].point)
+    commands = [command for _, command in campaign.cases]
+    inputs = repeat(campaign), repeat(weights), commands, _plan_logs(pool, campaign, best)
+    groundings = list(pool.map(_ground_job, *inputs))
+
+    def of_cases(job: Callable[..., Any], weights: Weights) -> list[Any]:
+        return list(pool.map(job, repeat(campaign.config), groundings, repeat(weights)))
+
+    at_best = of_cases(_evaluate_job, weights)
+    model_losses = np.array([case.loss for case in at_best])
+    scales = rows[best].losses / rows[0].losses / model_losses / len(commands)
+
+    def evaluate(point: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
+        weights = weights_at(campaign, space, point)
+        walked = np.array_equal(point, rows[best].point)
+        cases = at_best if walked else of_cases(_evaluate_job, weights)
+        if any(step_status(campaign.config, case) != StepStatus.ACCEPTED for case in cases):
+            return np.inf, np.zeros_like(point)
+        slopes = [slope_of(campaign, space, weights, case.gradient) for case in cases]
+        return float(scales @ [float(case.loss) for case in cases]), scales @ np.array(slopes)
+
+    def matrix(point: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
+        matrices = of_cases(_matrix_job, weights_at(campaign, space, point))
+        return matrix_of(campaign, space, np.tensordot(scales, matrices, axes=1))
+
+    return Model(evaluate, matrix)
+
+
+def add_walk(
+    campaign: Campaign, rows: Sequence[Row], proposal: Proposal, cases: Sequence[ScoredLog]
+) -> list[Row]:
+    """Append a walk to the history and save it in the folder: first its logs, then its row.
+
+    The logs of a walk that was reported are there already.
+    """
+    if not campaign.reported:
+        for path, (_, log) in zip(log_paths(campaign, len(rows)), cases, strict=True):
+            save_tree(path, log, kind="log", robot=campaign.robot)
+    row = row_of(proposal, cases)
+    arrays = {"point": row.point.tolist(), "losses": row.losses.tolist()}
+    add_row(campaign.folder / RECORD, row._asdict() | arrays)
+    return [*rows, row]
+
+
+def answer(campaign: Campaign, space: Space, rows: Sequence[Row]) -> tuple[Weights, int]:
+    """Return the best weights and the number of their walk; see `few_walks.incumbent`."""
+    number = few_walks.incumbent(space, _walked(rows))
+    return weights_at(campaign, space, rows[number].point), number
+
+
+def candidates(pool: Executor, campaign: Campaign, rows: Sequence[Row]) -> dict[str, Weights]:
+    """Return the start, each set that was 1 % better than all before it, and that of `answer`."""
+    space, history = campaign_space(pool, campaign), _walked(rows)
+    losses = np.array([result.loss for result in history])
+    better = losses[1:] < np.minimum.accumulate(losses)[:-1] - few_walks.GAIN
+    numbers = {0, *(1 + np.flatnonzero(better)), few_walks.incumbent(space, history)}
+    return {f"set {n}": weights_at(campaign, space, rows[n].point) for n in sorted(numbers)}
+
+
+def tune_on_walks(pool: Executor, campaign: Campaign, walks: int) -> list[Row]:
+    """Walk and tune on the plants of a campaign, from the walks in its folder on; return all rows.
+
+    Args:
+        pool: worker processes.
+        campaign: settings, all of whose plants are present.
+        walks: budget; whole rounds of all cases are walked, at least the start. If that falls,
+            nothing is tuned.
+
+    Raises:
+        InputError: see `next_proposal` and `read_history`.
+    """
+    rows, space, cases = (
+        read_history(campaign),
+        campaign_space(pool, campaign),
+        len(campaign.cases),
+    )
+    with bar(f"tuning with {plural(walks, 'walk')}") as report_progress:
+        while not rows or (_stood(rows[0]) and (len(rows) + 1) * cases <= walks):
+            report_progress(len(rows) * cases, walks, _progress(campaign, space, rows))
+            proposal, weights = next_proposal(pool, campaign, space, rows)
+            inputs = repeat(campaign), repeat(weights), range(cases)
+            rows = add_walk(campaign, rows, proposal, list(pool.map(walk_case, *inputs)))
+        report_progress(len(rows) * cases, walks, _progress(campaign, space, rows))
+    if campaign.leg_numbers and all(row.method in ("start", "model") for row in rows):
+        say(f"{', '.join(campaign.leg_numbers)} were not moved: walks beyond the model are needed")
+    if not _stood(rows[0]):
+        say("the set from which to tune on walks fell, or a QP was not solved; it is kept as it is")
+    return rows
+
+
+def _stood(row: Row) -> bool:
+    """Tell whether no case fell and all QPs were solved."""
+    return bool(np.isfinite(row.losses).all())
+
+
+class Change(NamedTuple):
+    """Result of a proposal relative to the start."""
+
+    method: str
+    predicted: float | None  # [%] None where nothing was predicted
+    change: float | None  # [%] of L; None where the robot fell or a QP was not solved
+
+
+def changes_by_walk(rows: Sequence[Row]) -> list[Change]:
+    """Return the result of each proposal."""
+
+    def percent(loss: float | None) -> float | None:
+        return None if loss is None or np.isinf(loss) else 100.0 * float(np.expm1(loss))
+
+    return [Change(row.method, *map(percent, (row.predicted, row.loss))) for row in _walked(rows)]
+
+
+def _progress(campaign: Campaign, space: Space, rows: Sequence[Row]) -> str:
+    if not rows:
+        return "compiling"
+    best = few_walks.best_walk(_walked(rows))
+    change = f"best L {changes_by_walk(rows)[best].change or 0.0:+.0f} % against the start"
+    weights = weights_at(campaign, space, rows[best].point)
+    logs = np.asarray(steps_between(campaign.start, weights))
+    moved = sorted(zip(direction_names(weights), logs, strict=True), key=lambda x: -abs(x[1]))[:3]
+    factors = ", ".join(f"{name} {np.exp(log):.2g} times" for name, log in moved)
+    return f"{change}; {factors}" if best else change
