@@ -25,6 +25,7 @@ _MODULES = {
     "sim.loop": ("Job",),
     "sim.walk": ("walk",),
     "sim.world": ("hfs", "ideal"),
+    "grfm.effect": ("last_command",),
     "grfm.network": ("as_effect", "load_net"),
     "tuning.loss": ("PAPER_LOSS", "LossTerm"),
     "tuning.rollout": ("RolloutConfig", "Scenario", "rollout"),

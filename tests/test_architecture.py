@@ -14,7 +14,7 @@ from hector_jax.store import nets
 
 ROOT = Path(__file__).parents[1] / "hector_jax"
 METHOD = "core robot qp control sim grfm tuning search".split()
-APPLICATION = "importing store verdict walk_tuning export report cli".split()
+APPLICATION = "importing store verdict walk_tuning export report cli __main__".split()
 FLOOR = {room: height for height, room in enumerate([*METHOD, *APPLICATION])}
 DOORS = {
     "mujoco": ("core.headless", "sim.mjx_model"),
@@ -116,7 +116,9 @@ def test_of_the_scripts_only_those_with_verdicts_reach_the_stand_in():
         for path in scripts
         if any(name.startswith("hector_jax.sim.standin") for name in imported(path))
     }
-    experiments = {f"experiments.{name}" for name in ("robustness", "online", "batch", "table")}
+    experiments = {
+        f"experiments.{name}" for name in ("robustness", "online", "batch", "table", "pictures")
+    }
     assert knowing == experiments | {"benchmarks.golden"}
 
 

@@ -63,14 +63,17 @@ def refused(monkeypatch, capsys, *arguments):
     return lines[0]
 
 
-def test_help_names_the_commands():
+@pytest.mark.parametrize("words", [(), ("--help",)])
+def test_help_opens_with_what_is_typed_first_and_names_each_command_once(words):
     shown = subprocess.run(
-        [sys.executable, "-m", "hector_jax.cli.main", "--help"], capture_output=True, text=True
+        [sys.executable, "-m", "hector_jax", *words], capture_output=True, text=True
     )
-    assert shown.returncode == 0
-    for name in COMMANDS:
-        assert name in shown.stdout
-    assert shown.stderr == ""
+    assert (shown.returncode, shown.stderr) == (0, "")
+    rows = re.findall(r"^  (\w+) +\S", shown.stdout, re.MULTILINE)
+    assert rows[:6] == ["tune", "view", "export", "robot", "walk", "evaluate"]
+    assert sorted(rows) == sorted(COMMANDS)
+    assert max(map(len, shown.stdout.splitlines())) < 88
+    assert "hector tune --traj straight" in shown.stdout.splitlines()[2]
 
 
 def test_importing_the_commands_prints_nothing_and_leaves_no_file(tmp_path):

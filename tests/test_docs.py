@@ -535,3 +535,17 @@ def test_notebooks_run_to_their_end(name, tmp_path):
     assert any(cell.get("outputs") for cell in notebook.cells)  # the site shows these
     where = {"metadata": {"path": str(tmp_path)}}
     nbclient.NotebookClient(notebook, timeout=900, resources=where).execute()
+
+
+@pytest.mark.slow
+def test_the_example_tunes_in_25_lines_and_walks_better():
+    example = ROOT / "examples" / "tune.py"
+    assert len(example.read_text().splitlines()) <= 25
+    shown = subprocess.run(
+        [sys.executable, example], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
+    row = r"^(\w+): ([\d.]+) cm off, ([\d.]+) degrees in pitch, fell: False$"
+    rows = re.findall(row, shown, re.MULTILINE)
+    assert [name for name, *_ in rows] == ["plain", "tuned"]
+    for plain, tuned in zip(rows[0][1:], rows[1][1:], strict=True):
+        assert float(tuned) < float(plain)

@@ -50,7 +50,6 @@ def test_flags_are_taken_in_any_order_and_spelling():
 @pytest.mark.parametrize(
     ("line", "fault"),
     [
-        ("", "no command; the commands are collect, train, "),
         ("wlak", "unknown command 'wlak'; did you mean 'walk'?"),
         ("wlak --help", "unknown command 'wlak'; did you mean 'walk'?"),
         ("walk --wrold hfs", "walk has no flag '--wrold'; did you mean '--world'?"),

@@ -13,8 +13,8 @@ from hector_jax.core.trajectory import State
 from hector_jax.grfm.nets import History
 from hector_jax.report import plots
 from hector_jax.report.fidelity import Drift
-from hector_jax.report.motion import COLOURS, motions
-from hector_jax.report.plots import distances
+from hector_jax.report.motion import motions
+from hector_jax.report.plots import distances, style
 from hector_jax.report.plots.style import SETS, label_of, looks_of
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.loss import PAPER_LOSS
@@ -79,7 +79,7 @@ def test_below_a_film_stand_the_distances_and_where_the_axes_are(tmp_path, drawn
     with Image.open(tmp_path / "a.png") as picture:
         assert picture.size == (800, 132)
         inside = np.asarray(picture.convert("RGB"))[box[1] : box[3], box[0] : box[2]]
-    for colour in COLOURS:
+    for colour in style.rgb_of(pair):
         assert (np.abs(inside.astype(int) - colour).sum(axis=-1) < 30).any()
     away = (walks["with"].state.position - walks["with"].reference.position)[:, :2]
     found = lines(drawn[0].axes[0])

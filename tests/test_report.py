@@ -56,6 +56,7 @@ def _report(verdict=None, film="no film: MuJoCo cannot draw here (egl: no device
         config={"traj": "straight", "seeds": 8, "choice_plants": 4, "tune": {"ridge": 0.003}},
         environment=environment(),
         command="make tune TRAJ=straight",
+        run="latest",
         proposals=(),
         best_proposal="",
         cases=0,
@@ -190,6 +191,20 @@ def test_the_report_tells_everything_that_was_promised(tmp_path):
         "the paper's footnote".capitalize(),
     ):
         assert words in text, words
+
+
+def test_the_report_opens_with_errors_falls_and_what_to_do_next(tmp_path):
+    verdict = pretend_verdict(fallen={("expert", 0)})
+    lines = report.first_lines(verdict, "latest")
+    assert len(lines) == 3
+    of = report.plain_errors(verdict, "with")
+    assert lines[0].startswith(f"with is {of['plane']:.1f} cm off, ")
+    assert f"{of['pitch']:.1f} degrees in pitch (RMS); nominal " in lines[0]
+    assert lines[1].endswith("the tuning has not seen: with 0, nominal 0, expert 1.")
+    assert all(f"`hector {name} latest`" in lines[2] for name in ("view", "export"))
+    text = write_report(tmp_path, **_report(verdict)).read_text()
+    assert text.split("\n\n")[1:4] == lines
+    assert text.split("\n\n")[4].startswith("| RMS error | in the plane [cm] |")
 
 
 def test_the_report_names_the_iteration_that_was_taken_and_the_errors_of_touchdowns(tmp_path):

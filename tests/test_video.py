@@ -16,6 +16,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State
 from hector_jax.report import render, video
 from hector_jax.report.motion import motion, motions, poses
+from hector_jax.report.plots import style
 from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film, write_strip
 from hector_jax.robot.description import MODEL_PATH
 from hector_jax.robot.model import load_robot
@@ -88,22 +89,43 @@ def test_snapshots_show_as_many_phases_of_the_gait_as_there_are(robot, seconds, 
     np.testing.assert_allclose(np.mod(times, cycle) / cycle, np.arange(tiles) / tiles, atol=0.01)
 
 
-def test_the_camera_of_four_seconds_stands_still_and_sees_the_whole_reference(robot):
+def test_the_camera_goes_beside_the_reference_and_turns_with_the_robot(robot):
     walk = pretend_walk(seconds=4.0, turn=np.pi / 4)
-    scene = scene_of(robot, {"a": walk, "b": walk}, 0.1 * np.arange(41))
-    first, *rest = render._cameras(scene, 40.0, 1.0, 4.0)
-    assert all((camera.lookat == first.lookat).all() for camera in rest)
-    turn = [90.0 - first.azimuth, -first.elevation]  # looks along y, then down
-    R = Rotation.from_euler("zx", turn, degrees=True).as_matrix()
-    for height in (0.0, scene.top):
-        points = walk.reference.position * [1.0, 1.0, 0.0] + [0.0, 0.0, height]
-        across, ahead, up = ((points - first.lookat) @ R.T).T
-        seen = np.tan(np.deg2rad(20.0)) * (ahead + first.distance)
-        assert (np.abs(across) < seen).all()
-        assert (np.abs(up) < seen).all()
-    close, *_, last = render._cameras(scene, 40.0, 1.0, 0.8)
-    assert close.distance < first.distance
-    assert np.linalg.norm(last.lookat - close.lookat) > 0.5
+    scene = scene_of(robot, {"a": walk, "b": walk}, 0.1 * np.arange(1, 41))
+    cameras = render._cameras(scene, 40.0, 1.0)
+    _, top = render._extent(scene)
+    assert 0.6 < top < 0.8
+    for time, (one, other) in zip(scene.times, cameras, strict=True):
+        assert (one.lookat == other.lookat).all()
+        (sample,) = scene.motions["a"].sample_at(np.array([time]))
+        place = walk.reference.position[sample] * [1.0, 1.0, 0.0] + [0.0, 0.0, top / 2]
+        assert np.linalg.norm(one.lookat - place) < 0.05
+        assert abs(one.azimuth - render._ASIDE - np.rad2deg(np.pi / 4 * time)) < 15.0
+        for height in (0.0, top):  # head and feet are in the image
+            point = place * [1.0, 1.0, 0.0] + [0.0, 0.0, height]
+            u, v = render._project(one, 40.0, (400, 400), point)
+            assert 100.0 < u < 300.0
+            assert 0.0 < v < 400.0
+    assert len({camera.distance for pair in cameras for camera in pair}) == 1
+
+
+def test_the_camera_stays_where_a_robot_fell(robot):
+    walks = {
+        "a": pretend_walk(seconds=2.0, fall_at=0.5),
+        "b": pretend_walk(seconds=2.0),
+    }
+    times = np.array([0.4, 1.0, 2.0])
+    cameras = render._cameras(scene_of(robot, walks, times), 40.0, 1.0)
+    fell, walked = np.array([[camera.lookat for camera in pair] for pair in cameras]).swapaxes(0, 1)
+    np.testing.assert_array_equal(fell[1], fell[2])
+    assert np.linalg.norm(walked[2] - walked[1]) > 0.4
+
+
+def test_a_film_has_the_colours_of_the_weight_sets_by_name_or_title():
+    nominal, best = style.rgb_of(["nominal", "best"])
+    assert style.rgb_of(style.titled({"nominal": 1, "best": 2})) == [nominal, best]
+    assert best == (31, 47, 143)
+    assert style.rgb_of(["best", "mine"])[0] == best
 
 
 @pytest.mark.filterwarnings("ignore:os.fork")  # of the reader used here, not of the writer

@@ -383,5 +383,5 @@ def command(word: str) -> type[Any]:
     """
     if word not in COMMANDS:
         hint = did_you_mean(word, COMMANDS) or f"; the commands are {', '.join(COMMANDS)}"
-        raise InputError((f"unknown command {short_repr(word)}" if word else "no command") + hint)
+        raise InputError(f"unknown command {short_repr(word)}{hint}")
     return COMMANDS[word]

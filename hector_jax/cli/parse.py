@@ -22,11 +22,40 @@ from hector_jax.cli.flags import COMMANDS, NAMED_WEIGHTS, PathKind, command, nam
 from hector_jax.core.inputs import InputError, check_file, did_you_mean, one_line, short_repr
 from hector_jax.core.settings import SEED, convert, from_table, read_json, read_toml, to_table
 
-_ABOUT = (
-    "Gradient tuning of a walking robot's model predictive controller. "
-    "The whole way, from data to evaluation: hector tune --traj straight. "
-    "Exit codes: 0 done, 1 something is broken, 2 bad input, 130 interrupted."
-)
+OVERVIEW = {
+    "What you type first": {
+        "tune": "tune weights for a trajectory, evaluate them, write a report",
+        "view": "show a run in the browser, before and after: hector view latest",
+        "export": "write weights, lines for C++, the compiled controller: hector export latest",
+        "robot": "make the file of your own robot from its MJCF or URDF",
+        "walk": "walk once; errors in cm and degrees, and a film with --video",
+        "evaluate": "compare weight sets on simulated robots",
+    },
+    "Compare": {
+        "verdict": "weight sets in several engines, and what may be claimed of them",
+        "compare": "finished runs side by side",
+    },
+    "Tune on the walks of a robot, or of a simulator elsewhere": {
+        "propose": "the weights to walk with next",
+        "report": "take the logs of these walks",
+    },
+    "Single steps of a tuning": {
+        "collect": "walk on the simulator and record the ground forces",
+        "train": "train GRFM-Net, the model of the ground, on these walks",
+        "grfm": "how well that net predicts walks that it never saw",
+        "search": "search for weights on the simulator, without derivatives",
+    },
+    "This machine": {"doctor": "versions, devices, cache and video, with a test"},
+}
+"""Each command in a line, under headings, in the order of `hector --help`."""
+
+_HEAD = """hector tunes the weights of a walking robot's model predictive controller.
+
+    hector tune --traj straight     # tune, evaluate, report: minutes, no GPU
+    hector view latest              # look at it in the browser
+    hector COMMAND --help           # flags of a command, with an example
+"""
+_EXIT_CODES = "Exit codes: 0 done, 1 something is broken, 2 bad input, 130 interrupted."
 _HELP = ("-h", "--help")
 _COMPLETION = "--tyro-print-completion"
 _LATEST = Path("latest")  # stands for the newest run
@@ -42,7 +71,7 @@ def from_line(words: Sequence[str]) -> Any:
     """Read a command and its flags from the words after `hector`.
 
     Flags that are not on the line come from the file of `--config`, else from their defaults. Help
-    is printed and exits by SystemExit.
+    is printed, also without a word, and exits by SystemExit.
 
     Raises:
         InputError: one line with the word that is unknown, repeated, missing, unexpected or of the
@@ -50,8 +79,11 @@ def from_line(words: Sequence[str]) -> Any:
     """
     helps = [word for word in words if word in _HELP]
     name, *rest = [word for word in words if word not in _HELP] or [""]
-    if (helps and not name) or name == _COMPLETION:
+    if name == _COMPLETION:
         return _all_commands(words)
+    if not name:
+        print(overview())
+        raise SystemExit(0)
     return read_flags(command(name), [*rest, *helps], f"hector {name}")
 
 
@@ -74,10 +106,19 @@ def read_flags(kind: type[Flags], words: Sequence[str], program: str) -> Flags:
     return with_given(_quietly(kind, words, **options), (x.replace("-", "_") for x in given))
 
 
+def overview() -> str:
+    """Return the text of `hector --help`."""
+    lines = [_HEAD]
+    for heading, commands in OVERVIEW.items():
+        rows = [f"  {name:<10s}{text}" for name, text in commands.items()]
+        lines += [f"{heading}:", *rows, ""]
+    return "\n".join([*lines, _EXIT_CODES])
+
+
 def _all_commands(words: Sequence[str]) -> Any:
     """Run tyro's own flags on all commands; exits by SystemExit."""
     kinds = [Annotated[kind, tyro.conf.subcommand(name)] for name, kind in COMMANDS.items()]
-    return _tyro(Union[tuple(kinds)], words, prog="hector", description=_ABOUT)  # noqa: UP007
+    return _tyro(Union[tuple(kinds)], words, prog="hector")  # noqa: UP007
 
 
 def _quietly(kind: type, words: Sequence[str], **options: Any) -> Any:

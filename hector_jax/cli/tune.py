@@ -30,7 +30,7 @@ from hector_jax.core.runtime import workers
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.network import as_effect
 from hector_jax.report import fidelity, pictures
-from hector_jax.report.report import Picture, print_table
+from hector_jax.report.report import Picture, first_lines, print_table
 from hector_jax.report.run import write_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
@@ -162,8 +162,10 @@ def _tune_in(folder: Path, args: Tune) -> None:
     known = determined(tuned.tunings["with"].precision, config.ridge, names)
     result, by_name = _result(run, tuned, walks, known)
     write_json(folder / VERSIONS, made_with | {"seconds": f"{time.monotonic() - start_time:.0f}"})
+    name_of_run = "latest" if Path("runs").resolve() in folder.resolve().parents else str(folder)
     report = write_report(
         folder,
+        run=name_of_run,
         trajectory=run.name,
         verdict=by_name[run.name],
         norms=norms,
@@ -183,6 +185,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     )
 
     def print_text() -> None:
+        print(*first_lines(by_name[run.name], name_of_run), "", sep="\n")
         for name, verdict in by_name.items():
             print_table(verdict, f"{name}, {plural(args.seeds, 'plant')}")
         if show:

@@ -1,5 +1,7 @@
 """`hector view`: show a run on a web page, or as a film and pictures."""
 
+import math
+
 from hector_jax.cli import arguments
 from hector_jax.cli.flags import View
 from hector_jax.control.controller import walk_config
@@ -52,8 +54,9 @@ def view_run(args: View) -> None:
         say(f"walking in {args.world}, seed {args.seed}")
         for when, (name, (weights, words)) in zip(("before", "after"), sets.items(), strict=True):
             trajectory = arguments.walk_once(args, robot, command, weights)
-            loss = metrics.score(request.loss, trajectory).L / 1e6
-            lines.append(f"{when}: {words}, L {loss:.3f}e6 in this walk")
+            score = metrics.score(request.loss, trajectory)
+            plane, loss = 100 * math.hypot(*score.rms_position[:2]), score.L / 1e6
+            lines.append(f"{when}: {words}, {plane:.1f} cm off (RMS), L {loss:.3f}e6")
             say(f"  {lines[-1]}")
             trajectory = at_interval(trajectory, walk_config(robot).gait.tick)
             walks[name] = view.ViewedWalk(trajectory, fidelity.curves(robot, trajectory, effects))

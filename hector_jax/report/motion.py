@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from hector_jax.core.trajectory import State, Trajectory, Wrench, from_start
 from hector_jax.robot.model import Robot
 
-COLOURS = ((184, 33, 51), (0, 122, 94))  # before and after
 INK = (20, 20, 25)
 MIN_SOLE = 0.015  # [m] least length of a footprint ahead of and behind the foot point
 

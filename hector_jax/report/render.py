@@ -4,7 +4,8 @@ It runs in a folder with `scene.pickle`.
 """
 
 import pickle
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -16,15 +17,16 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
 from hector_jax.core.headless import mujoco
-from hector_jax.report.motion import COLOURS, INK
+from hector_jax.report.motion import INK, Motion
 from hector_jax.report.plots import distances
 from hector_jax.report.video import Scene
 
-_WINDOW = 4.0  # [s] of the reference in view of a film
-_STRIP_WINDOW = 0.8  # [s] of the reference in view of a snapshot
 _SAMPLE = 0.02  # [s] between the points of the lines on the floor
 _DASH = 4  # points of a dash
-_DOWN, _ASIDE = 30.0, 35.0  # [deg] of the camera, against the horizon and the heading
+_DOWN, _ASIDE = 8.0, 68.0  # [deg] of the camera, against the horizon and the heading
+_ROOM = np.array([1.1, 1.2])  # of the image, across and up, in reaches of the robot
+_SMOOTH = 0.8  # [s] over which the camera's heading is a mean
+_FAR = 0.25  # distance from the reference at which the camera goes along, in heights of the robot
 _LAST = 1500  # [ms] of the last frame of an animated picture, before it repeats
 
 
@@ -51,13 +53,13 @@ def _views(scene: Scene, width: int, height: int) -> Iterator[list[UInt8[np.ndar
     quality = model.vis.quality  # half the time without a GPU, and no visible difference
     quality.shadowsize, quality.numslices, quality.numstacks = 1024, 16, 8
     accent = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MATERIAL, "accent")
-    seconds = _STRIP_WINDOW if scene.strip else _WINDOW
-    cameras = _cameras(scene, model.vis.global_.fovy, width / height, seconds)
+    fovy = float(model.vis.global_.fovy)
+    cameras = _cameras(scene, fovy, width / height)
     motions, reference = list(scene.motions.values()), _floor_reference(scene)
     with mujoco.Renderer(model, height, width) as renderer:
 
         def view(i: int, sample: int, camera: mujoco.MjvCamera) -> np.ndarray:
-            motion, colour = motions[i], _rgba(COLOURS[i])
+            motion, colour = motions[i], _rgba(scene.colours[i])
             if accent >= 0:
                 model.mat_rgba[accent] = colour
             data.qpos[:] = motion.qpos[sample]
@@ -68,11 +70,36 @@ def _views(scene: Scene, width: int, height: int) -> Iterator[list[UInt8[np.ndar
             _lines(renderer.scene, pairwise(path), 5.0, 0.003, colour)
             dashes = zip(reference[:: 2 * _DASH], reference[_DASH :: 2 * _DASH], strict=False)
             _lines(renderer.scene, dashes, 2.5, 0.005, _rgba(INK))
-            return renderer.render()
+            picture = Image.fromarray(renderer.render())
+            if len(motions) > 1:
+                project = partial(_project, camera, fovy, picture.size)
+                _mark(picture, motion, sample, project, scene.colours[i])
+            return np.asarray(picture)
 
         samples = np.stack([motion.sample_at(scene.times) for motion in motions], axis=1)
-        for pair, camera in zip(samples, cameras, strict=True):
-            yield [view(i, sample, camera) for i, sample in enumerate(pair)]
+        for pair, views in zip(samples, cameras, strict=True):
+            inputs = zip(pair, views, strict=True)
+            yield [view(i, sample, camera) for i, (sample, camera) in enumerate(inputs)]
+
+
+def _mark(
+    picture: Image.Image,
+    motion: Motion,
+    sample: int,
+    project: Callable[[Float[np.ndarray, "3"]], tuple[float, float]],
+    colour: tuple[int, int, int],
+) -> None:
+    """Draw a cross where the centre of mass should be, and a dot where it is."""
+    draw = ImageDraw.Draw(picture, "RGBA")
+    x, y = project(motion.reference[sample])
+    u, v = project(motion.path[min(sample, max(motion.upright - 1, 0))])
+    size = picture.height / 24
+    for width, fill in ((7, (*INK, 255)), (3, (255, 255, 255, 255))):
+        draw.line((x - size, y, x + size, y), fill=fill, width=width)
+        draw.line((x, y - size, x, y + size), fill=fill, width=width)
+    radius = picture.height / 50
+    box = (u - radius, v - radius, u + radius, v + radius)
+    draw.ellipse(box, fill=(*colour, 255), outline=(255, 255, 255, 255), width=2)
 
 
 def _rgba(colour: tuple[int, int, int]) -> Float[np.ndarray, "4"]:
@@ -101,45 +128,85 @@ def _lines(scene: Any, lines: Iterable[Any], pixels: float, height: float, rgba:
         scene.ngeom += 1
 
 
-def _cameras(scene: Scene, fovy: float, aspect: float, seconds: float) -> list[mujoco.MjvCamera]:
-    """Place cameras behind and above, with the robot and `seconds` of the reference in view.
+def _cameras(scene: Scene, fovy: float, aspect: float) -> list[list[mujoco.MjvCamera]]:
+    """Place a camera beside the robot for each time and walk, so that the robot fills the image.
 
-    In a walk that is no longer than that, the camera does not move.
+    It goes along with the reference and turns with the smoothed heading, so that both walks are
+    seen alike, and stops where a robot fell.
     """
-    last, top = list(scene.motions.values())[-1], scene.top
-    reference = _floor_reference(scene) * [1.0, 1.0, 0.0]
-    span = reference[-1] - reference[0]
-    heading = np.arctan2(span[1], span[0]) if np.linalg.norm(span) > top else 0.0
-    azimuth = np.rad2deg(heading) + _ASIDE
-    view = Rotation.from_euler("ZX", [azimuth - 90.0, 90.0 - _DOWN], degrees=True)
+    across, top = _extent(scene)
+    reach = _ROOM * [across, top / 2]
     slopes = np.tan(np.deg2rad(fovy) / 2) * np.array([aspect, 1.0])  # of the edges of the image
-    count = min(len(reference), round(seconds / _SAMPLE))
+    distance = float(np.max(reach / slopes))
+    last = list(scene.motions.values())[-1]
+    ahead = last.R_yaw[:, :, 0]
+    count = min(len(ahead), round(_SMOOTH / last.period))
+    yaw = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
+    padded = np.pad(yaw, (count // 2, count - 1 - count // 2), mode="edge")
+    azimuths = np.rad2deg(np.convolve(padded, np.full(count, 1 / count), "valid")) + _ASIDE
     cameras = []
-    for sample in last.sample_at(scene.times) // _spacing(last.period):
-        first = int(np.clip(sample - count // 2, 0, len(reference) - count))
-        floor = reference[first : first + count]
-        points = np.concatenate([floor, floor + [0.0, 0.0, top]])
-        points = view.apply(points, inverse=True)  # right, up, back
-        middle = (points.min(axis=0) + points.max(axis=0)) / 2
-        spread = np.abs(points[:, :2] - middle[:2]) + 0.3 * top * np.array([1.0, 0.4])
-        camera = mujoco.MjvCamera()
-        camera.lookat[:] = view.apply(middle)
-        camera.distance = np.max(spread / slopes + (points[:, 2:] - middle[2]))
-        camera.azimuth, camera.elevation = azimuth, -_DOWN
-        cameras.append(camera)
-    farthest = max(camera.distance for camera in cameras)
-    for camera in cameras:
-        camera.distance = farthest
+    for time in scene.times:
+        pair = []
+        for motion in scene.motions.values():
+            seen = min(time, motion.fall_time)
+            sample = motion.sample_at(np.array(seen))
+            place = motion.reference[sample, :2]
+            off = motion.path[sample, :2] - place
+            far = np.linalg.norm(off)  # a robot far from its reference stays in view
+            place = place + off * max(0.0, 1.0 - _FAR * top / max(far, 1e-9))
+            camera = mujoco.MjvCamera()
+            camera.lookat[:] = [*place, top / 2]
+            camera.distance = distance
+            camera.azimuth, camera.elevation = azimuths[last.sample_at(np.array(seen))], -_DOWN
+            pair.append(camera)
+        cameras.append(pair)
     return cameras
 
 
+def _extent(scene: Scene) -> tuple[float, float]:
+    """Return how far the robots' first poses reach from their middle, and their height [m]."""
+    data, model, reach = mujoco.MjData(scene.model), scene.model, []
+    for motion in scene.motions.values():
+        data.qpos[:] = motion.qpos[0]
+        mujoco.mj_forward(model, data)
+        R = data.geom_xmat.reshape(-1, 3, 3)
+        middle = data.geom_xpos + np.einsum("gij,gj->gi", R, model.geom_aabb[:, :3])
+        half = np.einsum("gij,gj->gi", np.abs(R), model.geom_aabb[:, 3:])
+        middle[:, :2] -= motion.path[0, :2]
+        body = model.geom_bodyid > 0
+        reach.append((np.abs(middle) + half)[body].max(axis=0))
+    x, y, z = np.max(reach, axis=0)
+    return float(np.hypot(x, y)), float(z)
+
+
+def _project(
+    camera: mujoco.MjvCamera, fovy: float, size: tuple[int, int], point: Float[np.ndarray, "3"]
+) -> tuple[float, float]:
+    """Return the pixel of a point, from the left and the top of an image."""
+    turn = [camera.azimuth - 90.0, 90.0 + camera.elevation]
+    view = Rotation.from_euler("ZX", turn, degrees=True)
+    right, up, back = view.apply(point - camera.lookat, inverse=True)
+    width, height = size
+    scale = height / 2 / np.tan(np.deg2rad(fovy) / 2) / (camera.distance - back)
+    return width / 2 + scale * right, height / 2 - scale * up
+
+
 def _encode(file: str, frames: Iterable[Image.Image], size: tuple[int, int], rate: int) -> None:
+    options: dict[str, Any]
     if not file.endswith(".mp4"):
         first, *rest = frames
         durations = [1000 // rate] * len(rest) + [_LAST]
-        first.save(file, save_all=True, append_images=rest, duration=durations, loop=0, quality=75)
+        first.save(
+            file,
+            save_all=True,
+            append_images=rest,
+            duration=durations,
+            loop=0,
+            quality=60,
+            method=6,
+        )
         return
-    options: dict[str, Any] = {"codec": "libx264", "macro_block_size": 2, "quality": None}
+    options = {"codec": "libx264", "macro_block_size": 2, "quality": None}
     options["output_params"] = ["-crf", "19", "-preset", "fast", "-movflags", "+faststart"]
     writer = imageio_ffmpeg.write_frames(file, size, fps=rate, ffmpeg_log_level="error", **options)
     writer.send(None)
@@ -161,12 +228,14 @@ def _frame(
     draw = ImageDraw.Draw(picture, "RGBA")
     height, half, _ = halves[0].shape
     for i, (label, motion) in enumerate(scene.motions.items()):
-        _text(draw, (i * half + 12, 12), label, COLOURS[i])
+        _text(draw, (i * half + 12, 12), label, scene.colours[i], size=20)
+        off = f"{100 * motion.distance[motion.sample_at(np.array(time))]:.1f} cm off"
         if time >= motion.fall_time:
-            _text(draw, (i * half + 12, 40), f"fell at {motion.fall_time:.2f} s", COLOURS[0])
+            off = f"fell at {motion.fall_time:.2f} s"
+        _text(draw, (i * half + half - 14, 12), off, size=20, anchor="rt")
     draw.rectangle((half - 1, 0, half, height - 1), fill="white")
-    _text(draw, (picture.width - 12, height - 12), f"{time:.1f} s", size=14, anchor="rb")
-    _text(draw, (picture.width - 12, 12), "dashed: reference", size=14, anchor="rt")
+    _text(draw, (picture.width - 14, height - 12), f"{time:.1f} s", anchor="rb")
+    _text(draw, (12, height - 12), "cross: reference, dot: robot", anchor="lb")
     return picture
 
 
@@ -176,7 +245,7 @@ def _strip(scene: Scene, columns: list[list[np.ndarray]]) -> Image.Image:
     draw = ImageDraw.Draw(picture, "RGBA")
     height, width, _ = columns[0][0].shape
     for i, label in enumerate(scene.motions):
-        _text(draw, (12, i * height + 12), label, COLOURS[i])
+        _text(draw, (12, i * height + 12), label, scene.colours[i])
         for k, time in enumerate(scene.times, 1):
             place = (width * k - 10, height * (i + 1) - 10)
             _text(draw, place, f"{time:.2f} s", size=14, anchor="rb")

@@ -112,6 +112,26 @@ def summaries(verdict: Verdict) -> dict[str, Summary]:
     return {name: metrics.summarize(verdict, name) for name in verdict.scores}
 
 
+def plain_errors(verdict: Verdict, name: str) -> dict[str, float]:
+    """Return the RMS errors of a set in the plane and in height [cm], in pitch and yaw [deg]."""
+    (_, pitch, yaw), (x, y, z) = metrics.rms(verdict, name)
+    lengths = {"plane": 100 * math.hypot(x, y), "height": 100 * z}
+    return {**lengths, "pitch": math.degrees(pitch), "yaw": math.degrees(yaw)}
+
+
+def first_lines(verdict: Verdict, run: str) -> list[str]:
+    """Say in three lines what a run has come to: errors, falls, what to do next.
+
+    Args:
+        verdict: on the stand-in, with `best` or, without it, a tuned set as its last one.
+        run: `latest` or the folder of the run.
+    """
+    tuned = "best" if "best" in verdict.scores else list(verdict.scores)[-1]
+    errors = {name: plain_errors(verdict, name) for name in (tuned, *baselines(verdict))}
+    falls = {name: int(summaries(verdict)[name].falls) for name in errors}
+    return render("first.txt.j2", verdict=verdict, errors=errors, falls=falls, run=run).splitlines()
+
+
 def baselines(verdict: Verdict) -> list[str]:
     """Return the baselines that another set can be compared with."""
     return [name for name in BASELINES if name in verdict.scores and len(verdict.scores) > 1]
@@ -197,7 +217,8 @@ TEMPLATES = Environment(
     lstrip_blocks=True,
     keep_trailing_newline=True,
 )
-_FUNCTIONS = (baselines, change_text, columns, legend, markdown_table, plural, summaries, wins_text)
+_FUNCTIONS = (baselines, change_text, columns, first_lines, legend, markdown_table, plain_errors)
+_FUNCTIONS += (plural, summaries, wins_text)
 TEMPLATES.globals |= {function.__name__: function for function in (*_FUNCTIONS, metrics.rms)}
 TEMPLATES.globals["BASELINES"] = BASELINES
 TEMPLATES.filters |= {

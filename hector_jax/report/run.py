@@ -35,6 +35,7 @@ def write_report(folder: Path, **contents: Any) -> Path:
             pictures, film: list of `Picture`; `Picture` of the film, or why there is none.
             config, environment: resolved settings, as JSON values; versions and machine.
             command: command line that repeats this run.
+            run: name of the run for the next commands, `latest` or its folder.
 
     Returns:
         The file.

@@ -1,10 +1,10 @@
 """Two walks of one command side by side: a film, and a strip of snapshots.
 
-Both halves have the same camera and, as each walk is shown in the frame of its start, the same
-reference. MuJoCo chooses its OpenGL back end when it is imported, and a broken back end may kill
-its process. So child processes (render.py) try the back ends in turn: EGL, OSMesa, GLFW, or only
-that of MUJOCO_GL if it is set. If none can draw, `VideoUnavailable` gives the reason in one line,
-and the run goes on without a film.
+The camera goes beside the reference. Both halves have the same one and, as each walk is shown in
+the frame of its start, the same reference. MuJoCo chooses its OpenGL back end when it is imported,
+and a broken back end may kill its process. So child processes (render.py) try the back ends in
+turn: EGL, OSMesa, GLFW, or only that of MUJOCO_GL if it is set. If none can draw,
+`VideoUnavailable` gives the reason in one line, and the run goes on without a film.
 """
 
 import os
@@ -28,14 +28,13 @@ from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, one_line
 from hector_jax.core.settings import AT_LEAST_ONE, Range, check, choose
 from hector_jax.report.motion import Motion
-from hector_jax.report.plots.style import label_of
+from hector_jax.report.plots.style import label_of, rgb_of
 from hector_jax.robot.model import Robot, compile_model
 
 BACK_ENDS = ("egl", "osmesa", "glfw")
 ENDINGS = (".mp4", ".webp", ".gif", ".png")  # all but the first are animated pictures
 
 _TIMEOUT = 300.0  # [s] for a back end to draw the whole film
-_TOP = 1.6  # height of the robot, in heights of its centre of mass
 
 
 class VideoUnavailable(Broken):
@@ -66,8 +65,8 @@ class Scene(NamedTuple):
     strip: bool
     config: VideoConfig
     model: mujoco.MjModel  # of the robot
-    top: float  # of the robot above the floor [m]
     motions: dict[str, Motion]  # before and after, by title
+    colours: list[tuple[int, int, int]]  # of the motions
     times: Float[np.ndarray, " K"]  # of the frames [s]
 
 
@@ -111,9 +110,9 @@ def write_film(
 def write_strip(
     path: Path, robot: Robot, motions: Mapping[str, Motion], config: VideoConfig | None = None
 ) -> str:
-    """Draw snapshots of two walks in two rows, spread over the phases of a gait cycle.
+    """Draw snapshots of walks, a row for each, spread over the phases of a gait cycle.
 
-    Args, returns and raises as `write_film`; the path is that of a PNG.
+    Args, returns and raises as `write_film`; the path is that of a PNG, and there may be one walk.
     """
     return _write(make_scene(path, robot, motions, config or VideoConfig(), strip=True), path)
 
@@ -122,7 +121,7 @@ def make_scene(
     path: Path, robot: Robot, motions: Mapping[str, Motion], config: VideoConfig, *, strip: bool
 ) -> Scene:
     """Collect the inputs of a film or a strip; arguments as in `write_film`."""
-    if len(motions) != 2:
+    if not strip and len(motions) != 2:
         raise ValueError(f"a film shows two walks side by side, got {len(motions)}: {[*motions]}")
     seconds = min(float(motion.times[-1]) for motion in motions.values())
     times = np.arange(0.0, seconds + 1e-9, 1.0 / config.rate)
@@ -133,8 +132,8 @@ def make_scene(
         strip=strip,
         config=config,
         model=compile_model(robot.description),
-        top=_TOP * float(robot.standing_height),
         motions={label_of(name): motion for name, motion in motions.items()},
+        colours=rgb_of(motions),
         times=times,
     )
 

@@ -22,7 +22,8 @@ from jaxtyping import Float
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory, Wrench
-from hector_jax.report.motion import COLOURS, INK, Motion
+from hector_jax.report.motion import INK, Motion
+from hector_jax.report.plots.style import rgb_of
 from hector_jax.report.report import render
 from hector_jax.store.folder import METRICS, RESULT, loss_curves, progress_sentence, read_histories
 
@@ -35,12 +36,7 @@ _MIN_ARROW = 0.07  # shorter ones are not drawn
 _HEAD = 0.083  # of an arrow
 _RADII = {"force": 0.019, "moment": 0.033}  # of the shafts of arrows
 _LEVER = 0.24  # of the moment that is drawn as long as the weight: the weight at this lever
-# colours and dashes of lines in plots: before, after, further sets
-_STROKES = (
-    *zip(COLOURS, ([6, 4], []), strict=True),
-    ((0, 114, 178), [2, 3]),
-    ((122, 62, 157), [10, 3, 2, 3]),
-)
+_DASHES = ([6, 4], [], [2, 3], [10, 3, 2, 3])  # of lines in plots: before, after, further sets
 _NO_CURVES = {"no iteration yet": np.full(1, np.nan)}  # viser refuses a plot without a line
 
 
@@ -236,7 +232,7 @@ class Page:
 
     def _add_walk(self, i: int) -> dict[str, Any]:
         """Add one walk to the scene; return the handles of its moving parts."""
-        scene, motion, colour = self._server.scene, self._motions[i], COLOURS[i]
+        scene, motion, colour = self._server.scene, self._motions[i], rgb_of(self._names)[i]
         root, pale = f"/world/{i}", tuple(int(c + 0.55 * (255 - c)) for c in colour)
         lines = {  # on the floor, at different heights [m] to avoid flicker
             "footholds": (motion.soles, 0.003, pale, 0.03),
@@ -312,8 +308,8 @@ def _plot(gui: Any, title: str, x_name: str, x: np.ndarray, lines: Mapping[str, 
 
 
 def _series(x_name: str, names: Mapping[str, Any]) -> tuple[dict[str, Any], ...]:
-    strokes = zip(names, cycle(_STROKES), strict=False)
-    lines = ({"label": n, "stroke": f"rgb{c}", "dash": d, "width": 2} for n, (c, d) in strokes)
+    looks = zip(names, rgb_of(names), cycle(_DASHES), strict=False)
+    lines = ({"label": n, "stroke": f"rgb{c}", "dash": d, "width": 2} for n, c, d in looks)
     return ({"label": x_name}, *lines)
 
 

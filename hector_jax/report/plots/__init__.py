@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from hector_jax.core.trajectory import FEET, Trajectory, Wrench, from_start
 from hector_jax.grfm.nets import History
 from hector_jax.report.fidelity import Drift
-from hector_jax.report.motion import COLOURS, Motion
+from hector_jax.report.motion import Motion
 from hector_jax.report.plots import style
 from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, label_of, looks_of
 from hector_jax.report.report import caption
@@ -83,15 +83,15 @@ def distances(
     last = max(motion.times[-1] for motion in motions.values())
     with drawing(path, width / dpi, height / dpi, dpi=dpi, legend_columns=0) as figure:
         axes = figure.subplots()
-        looks = zip(COLOURS, ((0, (5, 1.5)), "-"), strict=True)
-        for (name, motion), (colour, line) in zip(motions.items(), looks, strict=True):
+        colours = style.rgb_of(motions)
+        for (name, motion), colour in zip(motions.items(), colours, strict=True):
             upright = motion.times <= motion.fall_time
             distance = np.where(upright, 100 * motion.distance, np.nan)
             rms = "fell at once"
             if upright.any():
                 rms = f"{np.sqrt(np.mean(distance[upright] ** 2)):.1f} cm RMS"
-            style_of_line = {"color": np.divide(colour, 255), "linestyle": line}
-            axes.plot(motion.times, distance, **style_of_line, label=f"{label_of(name)}: {rms}")
+            line = {"color": np.divide(colour, 255), "linewidth": 2.2}
+            axes.plot(motion.times, distance, **line, label=f"{label_of(name)}: {rms}")
         axes.set_title("distance from the reference [cm]", loc="left")
         axes.set(xlabel="time [s]", xlim=(0.0, last), ylim=(0.0, None))
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.95), ncols=2, borderaxespad=0.1)

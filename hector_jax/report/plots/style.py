@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
@@ -96,6 +97,15 @@ def looks_of(names: Iterable[str], table: Mapping[str, Any] = SETS) -> dict[str,
 def label_of(name: str) -> str:
     """Return the legend text of a weight set, by its name in the tables, or of a curve."""
     return _NAMES.get(name, name)
+
+
+def rgb_of(titles: Iterable[str]) -> list[tuple[int, int, int]]:
+    """Return the colours, 0 to 255, of weight sets by their names or titles (of `titled`)."""
+    known = {label_of(name): name for name in SETS}
+    names = [title.partition(": ")[2] or title for title in titles]
+    looks = looks_of(known.get(name, name) for name in names)
+    colours = [to_rgb(looks[known.get(name, name)].color) for name in names]
+    return [(round(255 * r), round(255 * g), round(255 * b)) for r, g, b in colours]
 
 
 def titled(walks: Mapping[str, T]) -> dict[str, T]:

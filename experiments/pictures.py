@@ -1,0 +1,288 @@
+"""The pictures of README and docs: `python experiments/pictures.py NAME ...`, by default all.
+
+    method        how a tuning works, as a block diagram
+    film          the robot with plain and with tuned weights, side by side
+    before-after  errors along one walk of the sets nominal, expert and best
+    race          loss by the number of walks, against CMA-ES and Bayesian optimisation
+    robots        four robots walking
+    page          the browser page of a run (needs Chromium and a run: --run)
+
+Walks are those of the first plant of the hardware stand-in, which no tuning has read; the robots of
+`robots` walk on the high-fidelity simulator.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from lib import check_names
+from matplotlib.axes import Axes
+from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
+from PIL import Image, ImageDraw, ImageFont
+
+from hector_jax import (
+    Job,
+    Weights,
+    expert,
+    hfs,
+    load_robot,
+    named_command,
+    nominal,
+    setup_jax,
+    walk,
+    walk_config,
+)
+from hector_jax.control.weights_file import best
+from hector_jax.core.console import exit_code, say
+from hector_jax.core.trajectory import Trajectory
+from hector_jax.report.motion import motions
+from hector_jax.report.plots.style import SETS, drawing, label_of, looks_of
+from hector_jax.report.video import VideoConfig, write_film, write_strip
+from hector_jax.robot.model import Robot
+from hector_jax.sim.standin import standin
+
+ROOT = Path(__file__).parents[1]
+OUT = ROOT / "docs" / "pictures"
+RACE = ROOT / "experiments" / "reports" / "race" / "nominal" / "race.json"
+CLOSE_NOTICES = "document.querySelectorAll('.mantine-CloseButton-root').forEach(x => x.click())"
+METHODS = {  # of the race, by plain names, with their lines
+    "nominal walks": ("hector tune --walks", {"color": "#00805f", "linewidth": 2.2}),
+    "nominal turbo on model": (
+        "Bayesian optimisation (TuRBO with our model)",
+        {"color": "#e07c24", "linestyle": (0, (5, 1.5))},
+    ),
+    "nominal lq-cma-es": ("CMA-ES (lq)", {"color": "#7a3e9d", "linestyle": (0, (1.2, 1.2))}),
+}
+
+
+@dataclass(frozen=True)
+class Flags:
+    """Draw the pictures of README and docs."""
+
+    names: tyro.conf.Positional[tuple[str, ...]] = ()  # pictures; all by default
+    run: Path = Path("runs/straight")  # folder of a run of `hector tune`, for the page
+
+    def __post_init__(self) -> None:
+        check_names("names", self.names, PICTURES)
+
+
+def walk_of(weights: Weights, trajectory: str = "straight") -> Trajectory:
+    """Walk HECTOR on the first plant of the stand-in."""
+    robot = load_robot()
+    job = Job(weights, named_command(trajectory), standin(0), seed=0)
+    return walk(walk_config(robot), robot, job)
+
+
+# The method
+
+
+def _box(
+    axes: Axes, place: tuple[float, float], size: tuple[float, float], text: str, **look: str
+) -> None:
+    """Draw a box around a place, with a title and lines below it."""
+    (x, y), (width, height) = place, size
+    face: dict[str, Any] = {"facecolor": "#eef1f5", "edgecolor": "#33383f", **look}
+    shape = "round,pad=0,rounding_size=0.08"
+    corner = x - width / 2, y - height / 2
+    axes.add_patch(FancyBboxPatch(corner, width, height, boxstyle=shape, linewidth=1.2, **face))
+    title, *rest = text.split("\n")
+    up = 0.13 * len(rest)
+    centre: dict[str, Any] = {"ha": "center", "va": "center"}
+    axes.text(x, y + up, title, weight="bold", fontsize=11, **centre)
+    for i, line in enumerate(rest, 1):
+        axes.text(x, y + up - 0.27 * i, line, fontsize=9.5, **centre)
+
+
+def _arrow(
+    axes: Axes,
+    *points: tuple[float, float],
+    text: str = "",
+    at: tuple[float, float] = (0.0, 0.0),
+    **look: Any,
+) -> None:
+    """Draw an arrow along some points, with words at a place."""
+    line: dict[str, Any] = {"color": "#33383f", "linewidth": 1.6, **look}
+    for start, end in zip(points[:-2], points[1:-1], strict=True):
+        axes.plot(*zip(start, end, strict=True), solid_capstyle="round", **line)
+    style = "-|>,head_width=3.5,head_length=6"
+    last: dict[str, Any] = {"arrowstyle": style, "shrinkA": 0.0, "shrinkB": 0.0}
+    axes.add_patch(FancyArrowPatch(points[-2], points[-1], **last, **line))
+    if text:
+        axes.text(at[0], at[1], text, fontsize=9.5, ha="center", va="center", color=line["color"])
+
+
+def draw_method(path: Path) -> None:
+    """Draw the closed loop that is differentiated, and the way of its gradient."""
+    blue, orange = SETS["best"]["color"], "#b8560f"
+    with drawing(path, 9.6, 3.7, legend_columns=0) as figure:
+        axes = figure.subplots()
+        axes.set(xlim=(0, 12.2), ylim=(-0.05, 4.65), aspect="equal")
+        axes.axis("off")
+        main, y = (2.0, 1.15), 3.0
+        _box(axes, (0.85, y), (1.4, 1.15), "command\nvelocity,\nturning rate", facecolor="white")
+        _box(axes, (3.35, y), main, "MPC\na quadratic program\nwith weights Q, R")
+        _box(axes, (6.35, y), main, "ground model\nGRFM-Net: wished to\nreal ground force")
+        _box(axes, (9.1, y), (1.7, 1.15), "rigid body\ntrunk with\nmass, inertia")
+        _box(axes, (11.35, y), (1.4, 1.15), "loss\nerrors and\njerky forces", facecolor="white")
+        _arrow(axes, (1.55, y), (2.35, y))
+        _arrow(axes, (4.35, y), (5.35, y), text="wrench", at=(4.85, y + 0.22))
+        _arrow(axes, (7.35, y), (8.25, y), text="effect", at=(7.8, y + 0.22))
+        _arrow(axes, (9.95, y), (10.65, y))
+        top = 4.2
+        loop = (9.1, y + 0.58), (9.1, top), (3.35, top), (3.35, y + 0.58)
+        words = "state, every 10 ms, for a walk of 4 s (all of this is one program in JAX)"
+        _arrow(axes, *loop, text=words, at=(6.2, top + 0.2))
+        low = 1.55
+        back = (11.35, y - 0.58), (11.35, low), (3.35, low), (3.35, y - 0.58)
+        words = (
+            "gradient through every quadratic program: next Q, R (Gauss-Newton, at most ten steps)"
+        )
+        _arrow(axes, *back, text=words, at=(7.5, low - 0.22), color=blue, linewidth=2.6)
+        _box(axes, (1.55, 0.5), (2.6, 0.85), "MuJoCo\n64 walks, measured forces", edgecolor=orange)
+        learns = (2.85, 0.5), (6.35, 0.5), (6.35, low - 0.42)
+        axes.plot([6.35, 6.35], [low + 0.08, y - 0.72], color=orange, linewidth=1.6)
+        axes.plot(*zip(*learns, strict=True), color=orange, linewidth=1.6)
+        _arrow(axes, (6.35, y - 0.8), (6.35, y - 0.58), color=orange)
+        axes.text(4.6, 0.7, "trains, once", fontsize=9.5, ha="center", color=orange)
+
+
+# The walks
+
+
+def draw_film(path: Path) -> None:
+    """Film the plain and the tuned weights on one plant."""
+    pair = {"nominal": walk_of(nominal()), "best": walk_of(best())}
+    config = VideoConfig(width=720, height=488, rate=12)
+    write_film(path, load_robot(), motions(load_robot(), pair), config)
+
+
+def draw_before_after(path: Path) -> None:
+    """Draw the distance from the reference and the error in pitch along one walk of each set."""
+    sets = {"nominal": nominal(), "expert": expert(), "best": best()}
+    with drawing(path, 7.2, 2.6, dpi=190) as figure:
+        left, right = figure.subplots(1, 2)
+        for name, look in looks_of(sets).items():
+            one = walk_of(sets[name])
+            times = float(one.period) * np.arange(1, len(one.fallen) + 1)
+            off = np.asarray(one.state.position) - one.reference.position
+            distance = 100 * np.linalg.norm(off[:, :2], axis=1)
+            pitch = np.rad2deg(np.asarray(one.state.euler) - one.reference.euler)[:, 1]
+            for panel, values in ((left, distance), (right, pitch)):
+                panel.plot(
+                    times, np.where(one.fallen, np.nan, values), **look.line, label=label_of(name)
+                )
+        left.set(ylabel="distance from the reference [cm]", ylim=(0, None))
+        right.set(ylabel="error in pitch [degrees]")
+        right.axhline(0.0, color="black", linewidth=0.8)
+        for panel in (left, right):
+            panel.set(xlabel="time [s]", xlim=(0, 4))
+
+
+def draw_race(path: Path) -> None:
+    """Draw the loss of the best weights so far by the number of walks on the simulator."""
+    race = json.loads(RACE.read_text())["s"]
+    with drawing(path, 5.8, 3.1, dpi=190, legend_columns=2) as figure:
+        axes = figure.subplots()
+        for method, (label, line) in METHODS.items():
+            each = {int(walks): np.divide(x, 1e6) for walks, x in race[method]["own"].items()}
+            counts, losses = [*each], np.array([*each.values()])
+            axes.plot(counts, np.median(losses, axis=1), marker="o", label=label, **line)
+            band = losses.min(axis=1), losses.max(axis=1)
+            axes.fill_between(counts, *band, color=line["color"], alpha=0.15, linewidth=0)
+        axes.set(
+            xlabel="walks on the simulator (median and range of three repeats)",
+            ylabel="loss of the best so far [10$^6$]",
+        )
+        axes.set(xlim=(-2, 202), ylim=(0, None))
+
+
+def draw_robots(path: Path) -> None:
+    """Draw HECTOR with its set best, and three robots of the examples with plain weights."""
+    tiles = [_still(load_robot(), best(), "HECTOR: best")]
+    for name in ("strider", "quadruped", "humanoid"):
+        robot = load_robot(ROOT / "examples" / name / "robot.toml")
+        tiles.append(_still(robot, nominal(robot), f"{name}: nominal"))
+    width, height = tiles[0].size
+    picture = Image.new("RGB", (len(tiles) * (width + 4) - 4, height), "white")
+    for i, tile in enumerate(tiles):
+        picture.paste(tile, (i * (width + 4), 0))
+    picture.save(path, optimize=True)
+
+
+def _still(robot: Robot, weights: Weights, title: str) -> Image.Image:
+    """Return a picture of a walk, with the robot's name and mass below."""
+    job = Job(weights, named_command("straight"), hfs(robot.description), seconds=2.0)
+    moved = motions(robot, {title: walk(walk_config(robot), robot, job)})
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "still.png"
+        write_strip(file, robot, moved, VideoConfig(width=1000, height=560, tiles=4))
+        strip = Image.open(file).convert("RGB")
+    wide = strip.width // 4
+    tile = Image.new("RGB", (wide - 2, strip.height + 44), "white")
+    tile.paste(strip.crop((2 * wide + 1, 0, 3 * wide - 1, strip.height)), (0, 0))
+    words = f"{title.partition(':')[0]}, {float(robot.mass):.0f} kg"
+    place, font = (tile.width / 2, tile.height - 22), ImageFont.load_default(size=26)
+    ImageDraw.Draw(tile).text(place, words, "black", font, "mm")
+    return tile
+
+
+# The page
+
+
+def draw_page(path: Path, run: Path) -> None:
+    """Take a picture of the page of `hector view` on a run."""
+    sys.path.insert(0, str(ROOT / "tests"))
+    from browser import opened  # pyright: ignore[reportMissingImports]
+
+    port = 8765
+    words = [sys.executable, "-m", "hector_jax", "view", str(run), "--port", str(port)]
+    server = subprocess.Popen([*words, "--world", "standin"], stderr=subprocess.PIPE, text=True)
+    try:
+        assert server.stderr is not None
+        line = next(line for line in server.stderr if line.startswith("open http"))
+        address = line.split()[1]
+        with tempfile.TemporaryDirectory() as profile, opened(address, profile) as tab:
+            deadline = time.monotonic() + 240.0
+            while "before:" not in tab.text() and time.monotonic() < deadline:
+                time.sleep(2.0)
+            time.sleep(6.0)
+            tab.call("Runtime.evaluate", expression=CLOSE_NOTICES)
+            time.sleep(2.0)
+            Image.fromarray(tab.picture()).save(path, optimize=True)
+    finally:
+        server.terminate()
+        server.wait()
+
+
+PICTURES: dict[str, tuple[Path, Callable[[Path], None] | None]] = {
+    "method": (OUT / "method.svg", draw_method),
+    "film": (ROOT / "docs" / "walk.webp", draw_film),
+    "before-after": (OUT / "before-after.png", draw_before_after),
+    "race": (OUT / "race.png", draw_race),
+    "robots": (OUT / "robots.png", draw_robots),
+    "page": (OUT / "page.png", None),  # takes the run too
+}
+
+
+def main() -> None:
+    """Draw the pictures that are named."""
+    flags = tyro.cli(Flags, description=__doc__)
+    setup_jax()
+    OUT.mkdir(exist_ok=True)
+    for name in flags.names or PICTURES:
+        path, draw = PICTURES[name]
+        (draw or partial(draw_page, run=flags.run))(path)
+        say(f"{name}: {path}")
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code("pictures", main))

@@ -1,0 +1,168 @@
+"""README: each of its figures is that of a file, and it stays short."""
+
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hector_jax.control.controller import walk_config
+from hector_jax.control.reference import COMMANDS
+from hector_jax.control.weights_file import best
+from hector_jax.core.tree_file import tree_hash
+from hector_jax.robot.model import load_robot
+
+ROOT = Path(__file__).parents[1]
+REPORTS = ROOT / "experiments/reports"
+BEST = REPORTS / "best"  # evaluations of the sets on each command
+ROBOTS = REPORTS / "robots/robots.json"
+ROBUSTNESS = REPORTS / "robustness/robustness.json"
+RACE = REPORTS / "race/nominal/race.json"
+RUN = REPORTS / "run.json"  # the run whose lines README shows
+
+README = (ROOT / "README.md").read_text()
+TEXT = " ".join(README.split())
+PROSE = re.sub(r"```.*?```", "", README, flags=re.DOTALL)
+
+
+def cells(start):
+    """Cells of the row of a table that starts so, without bold type."""
+    (row,) = re.findall(rf"^\| {re.escape(start)}.*", README, re.MULTILINE)
+    return [cell.strip().replace("**", "") for cell in row.strip("|").split("|")[1:]]
+
+
+def evaluation(trajectory, name):
+    sets = json.loads((BEST / f"{trajectory}.json").read_text())["sets"]
+    return sets[name]["standin"]
+
+
+def plain(rms):
+    """Errors in the plane and in height [cm], in pitch and yaw [degrees]."""
+    (_, pitch, yaw), (x, y, z) = rms["euler"], rms["position"]
+    return 100 * math.hypot(x, y), 100 * z, math.degrees(pitch), math.degrees(yaw)
+
+
+def test_the_readme_is_read_in_two_minutes():
+    lines = [line for line in PROSE.splitlines() if not line.startswith("|")]
+    words = re.sub(r"\]\([^)]*\)", "]", "\n".join(lines)).split()
+    assert README.count("\n") <= 110
+    assert len(words) <= 700
+
+
+def test_the_readme_has_no_seeds_hashes_or_intervals():
+    hashes = re.findall(r"\b(?=\w*\d)(?=\w*[a-f])[0-9a-f]{7,40}\b", README)
+    assert hashes == []
+    assert not re.search(r"\bseeds?\b|\[-?\d+, -?\d+\]", README)
+
+
+def test_what_the_readme_links_is_there():
+    targets = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", README)
+    missing = {target for target in targets if not (ROOT / target).exists()}
+    assert missing == set()
+    assert len(targets) > 25
+
+
+@pytest.mark.parametrize("name", ["nominal", "expert", "best"])
+def test_the_errors_of_the_table_are_those_of_the_files(name):
+    *errors, falls = cells(f"`{name}`:")
+    each = [evaluation(trajectory, name) for trajectory in ("straight", "c", "s")]
+    for cell, one in zip(errors, each, strict=True):
+        plane, height, pitch, _ = plain(one["rms"])
+        assert cell == f"{plane:.1f} cm, {height:.1f} cm, {pitch:.1f}°"
+        assert f"on {len(one['seeds'])} simulated robots that took no part" in TEXT
+    assert falls == str(sum(one["falls"] for one in each))
+    assert list(COMMANDS) == ["straight", "c", "s"]
+
+
+def test_the_heading_is_told_as_the_file_of_the_s_curve_has_it():
+    tuned, expert = (plain(evaluation("s", name)["rms"])[3] for name in ("best", "expert"))
+    assert f"on the S curve it is {tuned:.1f}° off" in TEXT
+    assert f"with the laboratory's weights {expert:.1f}°" in TEXT
+
+
+def test_the_smoothness_is_that_of_the_files():
+    ratios = []
+    for trajectory in COMMANDS:
+        each = [evaluation(trajectory, name) for name in ("best", "expert")]
+        tuned, expert = (one["L_ctrl"]["mean"] - one["L_ctrl_switching"] for one in each)
+        ratios.append(tuned / expert)
+    assert f"changes {min(ratios):.1f} to {max(ratios):.1f} times as much" in TEXT
+
+
+def test_the_falls_under_disturbances_are_those_of_their_file():
+    report = json.loads(ROBUSTNESS.read_text())
+    assert report["weights"]["best"] == tree_hash(best())
+    shares = {n: 100 * one["falls"] / one["walks"] for n, one in report["totals"].items()}
+    told = "falls in {best:.0f} % of walks, plain weights in {nominal:.0f} %"
+    assert told.format(**shares) in TEXT
+    floor = [c["sets"] for c in report["cells"] if (c["traj"], c["level"]) == ("s", "friction 0.3")]
+    for name in ("best", "nominal"):
+        assert sum(c[name]["falls"] for c in floor) > sum(c[name]["walks"] for c in floor) / 2
+
+
+def test_what_a_run_prints_is_what_its_result_says():
+    sets = json.loads(RUN.read_text())["sets"]
+    each = {name: plain(sets[name]["rms"])[:3] for name in ("best", "nominal", "expert")}
+    first = "best is {:.1f} cm off, {:.1f} cm in height, {:.1f} degrees in pitch"
+    rest = ["{} {:.1f}, {:.1f}, {:.1f}".format(name, *each[name]) for name in [*each][1:]]
+    assert "; ".join([first.format(*each["best"]) + " (RMS)", *rest]) + "." in TEXT
+    falls = ", ".join(f"{name} {sets[name]['falls']}" for name in each)
+    walks = sets["best"]["plants"]
+    assert f"Falls in {walks} walks on robots that the tuning has not seen: {falls}." in TEXT
+
+
+@pytest.mark.parametrize(
+    ("start", "robot"),
+    [
+        ("`examples/quadruped`", "quadruped"),
+        ("Unitree Go2", "go2"),
+        ("`examples/humanoid`", "humanoid"),
+        ("Unitree H1", "h1"),
+    ],
+)
+def test_the_other_robots_are_told_as_their_file_has_them(start, robot):
+    runs = json.loads(ROBOTS.read_text())["all"][robot]
+    each = {
+        name: [runs[trajectory]["sets"][name]["standin-even"] for trajectory in COMMANDS]
+        for name in ("nominal", "best")
+    }
+    planes = {n: [f"{plain(one['rms'])[0]:.1f}" for one in ones] for n, ones in each.items()}
+    changes = [f"{one['change']['nominal']['median']:+.0f}" for one in each["best"]]
+    falls = [sum(one["falls"] for one in ones) for ones in each.values()]
+    walks = sum(len(one["seeds"]) for one in each["best"])
+    assert cells(start) == [
+        "{}, {}".format(*falls),
+        ", ".join(planes["nominal"]),
+        ", ".join(planes["best"]),
+        ", ".join(changes),
+    ]
+    assert f"falls in {walks} walks" in README
+    assert f"on {len(each['best'][0]['seeds'])} simulated robots each" in TEXT
+
+
+def test_the_race_is_told_as_its_file_has_it():
+    race = json.loads(RACE.read_text())["s"]
+    at = {
+        method: {walks: float(np.median(x)) / 1e6 for walks, x in one["own"].items()}
+        for method, one in race.items()
+    }
+    ours, bayes = at["nominal walks"], at["nominal turbo on model"]
+    evolution = min(at["nominal cma-es"]["200"], at["nominal lq-cma-es"]["200"])
+    assert f"(from {ours['0']:.2f}, see picture)" in TEXT
+    assert cells("Bayesian optimisation")[0] == f"200: {bayes['200']:.2f}"
+    assert cells("CMA-ES")[0] == f"200: {evolution:.2f}"
+    assert cells("this")[0].endswith(f"or 5 with `--walks`: {ours['5']:.2f}")
+    assert ours["5"] < min(bayes["200"], evolution)  # as the picture's words have it
+
+
+def test_the_robot_and_its_mpc_are_those_of_the_readme():
+    robot = load_robot()
+    config = walk_config(robot)
+    mpc, tick = config.mpc, config.gait.tick
+    assert f"a biped of {float(robot.mass):.0f} kg with ten motors" in TEXT
+    assert len(robot.description.joints) == 10
+    assert (mpc.horizon, mpc.step_ticks, tick) == (10, 3, 0.01)
+    assert "ten steps of 30 ms" in TEXT
+    assert "a plan every 10 ms" in TEXT
