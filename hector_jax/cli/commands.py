@@ -216,11 +216,18 @@ def export_controller(args: flags.Export) -> None:
     trajectory = arguments.load_trajectory(text, robot)
     name = f"{args.run.resolve().name}/{path.stem}" if is_run else path.stem
     folder = args.out or (args.run if is_run else args.run.parent) / "export"
-    weights, about = load_weights(path, robot), {"name": name, "seconds": args.seconds}
+    weights = load_weights(path, robot)
     say("exporting the controller and comparing it with the live one on a walk")
     with locked(folder):
-        inputs = config or walk_config(robot), robot, weights, trajectory.command
-        card = export.export(*inputs, folder, **about)
+        card = export.export(
+            config or walk_config(robot),
+            robot,
+            weights,
+            trajectory.command,
+            folder,
+            name=name,
+            seconds=args.seconds,
+        )
     print_result(args.json, card, lambda: _print_check(card["check"]))
     say(f"the export is in {folder}")
 

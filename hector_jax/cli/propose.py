@@ -169,5 +169,12 @@ def _campaign(args: Propose) -> Campaign:
     start = str(walks.weights_path(args.folder, 0)) if begun else args.start
     start = arguments.weights(start, robot)
     commands = {trajectory.name: trajectory.command for trajectory in trajectories}
-    inputs = args.folder, config, robot, start, commands
-    return Campaign(*inputs, seed=args.seed, leg_numbers=leg_numbers(args.tune))
+    return Campaign(
+        args.folder,
+        config,
+        robot,
+        start,
+        commands,
+        seed=args.seed,
+        leg_numbers=leg_numbers(args.tune),
+    )

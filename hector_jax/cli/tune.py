@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -125,9 +125,8 @@ class _Tuned(NamedTuple):
     best_proposal: str  # "set 3", the one that is `best` in place of it; empty without
 
 
-def _tune_in(folder: Path, args: Tune) -> None:
-    """Execute a run, reusing the results already in its folder."""
-    start_time, made_with = time.monotonic(), environment()
+def _begin(pool: Executor, folder: Path, args: Tune, commit: str) -> _Run:
+    """Read what the flags name, compile the programs and make or load the net."""
     robot = load_robot(args.robot)
     trajectories = run_folder.trajectories(args, robot)
     config = tunings.tune_config(robot, iterations=args.iterations, others=model_numbers(args.tune))
@@ -135,31 +134,52 @@ def _tune_in(folder: Path, args: Tune) -> None:
     start = arguments.weights(args.start, robot)
     data = arguments.data_folder(args.data, args.robot, robot)
     net = nets.load_trained(args.net, robot, args.variant)[0] if args.net else None
+    setup = Setup(pool, config, robot, commit)
+    hfs_folder = folder / _ARTEFACTS / "hfs"
+    check = partial(_check_start, setup, args.start, start, trajectories, hfs_folder)
+    config_of_best, start_of_best = choice.settings_of_best(
+        config, robot, start, smooth=args.smooth, safe=args.safe
+    )
+    one_command = tunings.Problem((trajectories[0].command,), None, 1)
+    for line in tunings.compile_programs(
+        setup,
+        start,
+        trajectories[0],
+        others=[(config_of_best, start_of_best, one_command)],
+        meanwhile=check,
+    ):
+        say(f"before any tuning, {trajectories[0].name} on hfs: {line}")
+    net = net or nets.load_or_train(pool, robot, data, args.variant)
+    return _Run(setup, folder, args, start, trajectories, net)
+
+
+def _with_aligned_loss(run: _Run, norms: Mapping[str, float]) -> _Run:
+    """Return a run whose terms of the loss have gradients of the same order."""
+    config = run.setup.config
+    loss = aligned(config.loss, norms)
+    say("loss weights: " + ", ".join(f"{term.name} {term.weight:g}" for term in loss))
+    return run._replace(setup=run.setup._replace(config=replace(config, loss=loss)))
+
+
+def _tune_in(folder: Path, args: Tune) -> None:
+    """Execute a run, reusing the results already in its folder."""
+    start_time, made_with = time.monotonic(), environment()
     with workers(args.processes) as pool:
-        setup = Setup(pool, config, robot, made_with.get("commit", ""))
-        inputs = setup, args.start, start, trajectories, folder / _ARTEFACTS / "hfs"
-        check = partial(_check_start, *inputs)
-        command = trajectories[0].command
-        prices = {"smooth": args.smooth, "safe": args.safe}
-        of_best = choice.settings_of_best(config, robot, start, **prices)
-        best = *of_best, tunings.Problem((command,), None, 1)
-        options = {"others": [best], "meanwhile": check}
-        for line in tunings.compile_programs(setup, start, trajectories[0], **options):
-            say(f"before any tuning, {trajectories[0].name} on hfs: {line}")
-        net = net or nets.load_or_train(pool, robot, data, args.variant)
-        run = _Run(setup, folder, args, start, trajectories, net)
+        run = _begin(pool, folder, args, made_with.get("commit", ""))
         norms = tunings.mean_norms(run.setup, run.problems)
         if args.alpha == "auto":
-            loss = aligned(config.loss, norms["with"])
-            say("loss weights: " + ", ".join(f"{term.name} {term.weight:g}" for term in loss))
-            run = run._replace(setup=run.setup._replace(config=replace(config, loss=loss)))
+            run = _with_aligned_loss(run, norms["with"])
         settings = _note_settings(run)
         tuned = _tune_sets(run)
         walks = _walk_sets(run, tuned.sets)
-        case = trajectories[0], run.seconds, run.folder / _ARTEFACTS / "elsewhere"
-        show = small_verdict(run.setup, tuned.sets, *case) if args.verdict else None
-    names = step_names(start, config.others)
-    known = determined(tuned.tunings["with"].precision, config.ridge, names)
+        first, elsewhere = run.trajectories[0], folder / _ARTEFACTS / "elsewhere"
+        show = None
+        if args.verdict:
+            show = small_verdict(run.setup, tuned.sets, first, run.seconds, elsewhere)
+    config = run.setup.config
+    known = determined(
+        tuned.tunings["with"].precision, config.ridge, step_names(run.start, config.others)
+    )
     result, by_name = _result(run, tuned, walks, known)
     write_json(folder / VERSIONS, made_with | {"seconds": f"{time.monotonic() - start_time:.0f}"})
     name_of_run = "latest" if Path("runs").resolve() in folder.resolve().parents else str(folder)
@@ -178,7 +198,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         chosen=tuned.chosen,
         smooth=args.smooth,
         draws=choice.DRAWS,
-        **_draw(run, tuned, *walks[trajectories[0].name]),
+        **_draw(run, tuned, *walks[first.name]),
         config=settings,
         environment=made_with,
         command=as_command("hector tune", run_folder.run_flags(args)),
@@ -210,8 +230,9 @@ def _check_start(
         options = {"title": f"walking {name} with the weights to start from", "folder": folder}
         walks = judging.score_jobs(setup, {case: job}, **options, with_walk=[case])
         if walks[case][0].score.fallen:
-            inputs = setup.config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
-            fall = setup.pool.submit(fall_of, *inputs).result() or "fell"
+            body, host_job = jax.tree.map(np.asarray, robot), on_host(job)
+            falling = setup.pool.submit(fall_of, setup.config.rollout.walk, body, host_job)
+            fall = falling.result() or "fell"
             where = f"{name} on the high-fidelity simulator"
             raise InputError(f"--start {text} cannot be tuned from: {where} {fall}")
 
@@ -282,9 +303,16 @@ def _campaign(run: _Run, start: Weights) -> Campaign:
     """Return the settings of the tuning on the walks of --walks, from the result of the tunings."""
     robot, config = run.setup.robot, replace(run.answer[0], others=run.setup.config.others)
     plants = choice.drawn_plants(robot, run.args.walk_plants) or [hfs(robot.description)]
-    inputs = run.folder / "walks", config, robot, start, run.commands, plants
-    engine = choose_engine(run.args.walk_engine)
-    return Campaign(*inputs, leg_numbers=leg_numbers(run.args.tune), engine=engine)
+    return Campaign(
+        run.folder / "walks",
+        config,
+        robot,
+        start,
+        run.commands,
+        plants,
+        leg_numbers=leg_numbers(run.args.tune),
+        engine=choose_engine(run.args.walk_engine),
+    )
 
 
 def _walk_sets(
