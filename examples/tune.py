@@ -8,7 +8,8 @@ hj.setup_jax()  # 64 bits, and a cache of compiled programs
 robot, command, start = hj.load_robot(), hj.named_command("straight"), hj.nominal()
 config = hj.TuneConfig(rollout=hj.RolloutConfig(ticks=200), iterations=5)  # walks of 2 s
 ground = hj.last_command  # the ground gives what the MPC wishes; or hj.as_effect(net) of a run
-tuning = hj.tune(config, robot, start, command, hj.standing_anchor(robot), ground)
+scenario = hj.Scenario(robot, command, hj.standing_anchor(robot), ground)
+tuning = hj.tune(config, scenario, start)
 print(f"{tuning.reason}; loss by step:", *(f"{x.evaluation.loss:.3g}" for x in tuning.iterations))
 
 for name, weights in {"plain": start, "tuned": tuning.weights}.items():

@@ -182,14 +182,12 @@ class Tune(Configured, Parallel):
     # fall less under pushes; default 0.19 of the robot's height
     safe: Annotated[float | None, Range(0.001, 10)] = None
     data: Folder = Path("data")  # folder of the walks and the net, which are made if missing
-    net: Annotated[Path | None, PathKind.FILE] = (
-        None  # file of another net, instead of that in DATA
-    )
+    # file of another net, instead of that in DATA
+    net: Annotated[Path | None, PathKind.FILE] = None
     runs: Folder = Path("runs")  # the run folder is RUNS/TRAJ/TIME
     out: Path | None = None  # the run folder itself, which must not exist (with --each: OUT/TRAJ)
-    resume: Annotated[Path | None, PathKind.RUN] = (
-        None  # continue the interrupted run in this folder
-    )
+    # continue the interrupted run in this folder
+    resume: Annotated[Path | None, PathKind.RUN] = None
     video: bool = True  # make a film of the nominal and the best weights
     # print up to 12 walks more: in other engines, or else with other masses of the robot
     verdict: bool = False
