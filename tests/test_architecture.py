@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import pytest
-import table_steps
 
 import hector_jax
 from hector_jax.store import nets
@@ -116,9 +115,7 @@ def test_of_the_scripts_only_those_with_verdicts_reach_the_stand_in():
         for path in scripts
         if any(name.startswith("hector_jax.sim.standin") for name in imported(path))
     }
-    experiments = {
-        f"experiments.{name}" for name in ("robustness", "online", "batch", "table", "pictures")
-    }
+    experiments = {f"experiments.{name}" for name in ("robustness", "batch", "pictures")}
     assert knowing == experiments | {"benchmarks.golden"}
 
 
@@ -204,6 +201,5 @@ def test_what_scripts_import_inside_functions_is_there_too():
     assert missing == []
 
 
-@pytest.mark.parametrize("code", [nets.COLLECTION_CODE, table_steps.SEARCH_CODE])
-def test_what_both_engines_compute_is_in_the_key_of_their_walks(code):
-    assert {"sim.walk", "sim.parallel"} <= set(code)
+def test_what_both_engines_compute_is_in_the_key_of_their_walks():
+    assert {"sim.walk", "sim.parallel"} <= set(nets.COLLECTION_CODE)

@@ -19,9 +19,6 @@ from unittest import mock
 import numpy as np
 import pytest
 from delay import AS_PROPOSED, BEFORE
-from table import PROGRAM, SETS
-from table import Flags as Table
-from table_report import paper_change
 
 import hector_jax
 from hector_jax.cli import flags, parse
@@ -99,33 +96,24 @@ def lines_of(path, program):
     return [line for line in lines if line.startswith(f"{program} ") and "<" not in line]
 
 
-CALLS = sorted(
-    {
-        (path.name, line)
-        for path in READ
-        for name in ("hector", PROGRAM)
-        for line in lines_of(path, name)
-    }
-)
+CALLS = sorted({(path.name, line) for path in READ for line in lines_of(path, "hector")})
 NAMED = sorted({n for path in READ for n in re.findall(r"`hector ([a-z]+)", path.read_text())})
 
 
 @pytest.mark.parametrize("name", NAMED)
 def test_commands_that_pages_name_are_there(name):
-    names = set(flags.COMMANDS)
-    assert name in names | {"table"}  # of which test_cli says what it answers
+    assert name in flags.COMMANDS
 
 
 @pytest.mark.parametrize(("page", "line"), CALLS)
 def test_commands_in_pages_parse(page, line, capsys):
-    table = line.startswith(PROGRAM)
-    words = shlex.split(line, comments=True)[2 if table else 1 :]
+    words = shlex.split(line, comments=True)[1:]
     if "--config" in words:  # a file of the reader's
         at = words.index("--config")
         del words[at : at + 2]
     code = 0
     try:
-        parse.read_flags(Table, words, PROGRAM) if table else parse.from_line(words)
+        parse.from_line(words)
     except SystemExit as left:  # after --help, too
         code = left.code
     assert code == 0, capsys.readouterr().err
@@ -143,18 +131,6 @@ def test_targets_of_make_in_pages_are_there(path):
     for line in lines_of(path, "make"):
         words = shlex.split(line, comments=True)[1:]
         assert {word for word in words if "=" not in word} <= there, line
-
-
-@pytest.mark.parametrize("quick", ["", "1"])
-def test_make_table_ends_with_a_verdict_of_its_sets(quick):
-    call = ["make", "-n", "--no-print-directory", "table", f"QUICK={quick}"]
-    said = subprocess.run(call, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    last = parse.from_line(shlex.split(said.replace("\\\n", " ").splitlines()[-1])[1:])
-    folder = Path("runs/table/quick" if quick else "runs/table")
-    own = [text.split("=") for text in last.weights if f"={folder}" in text]
-    assert own == [[name, f"{folder}/weights/{name}"] for name in ("without", "with", "search_200")]
-    assert {name for name, _ in own} <= set(SETS)
-    assert last.out == folder / "verdict"
 
 
 @pytest.mark.parametrize("path", READ, ids=lambda path: path.stem)
@@ -383,9 +359,11 @@ def test_the_tables_of_the_readme_are_those_of_the_results():
 
 def test_the_figures_of_the_paper_stand_beside_ours():
     page = (DOCS / "paper.md").read_text()
+    losses = report("paper.json")["losses"]
     for traj, name in {"straight": "straight", "c": "C curve", "s": "S curve"}.items():
+        of = {who: x["L"] for who, x in losses[traj].items()}
         pairs = [
-            (paper_change(traj, "with", base), sets(traj)["with"]["change"][base]["median"])
+            (100 * (of["with"] / of[base] - 1), sets(traj)["with"]["change"][base]["median"])
             for base in ("nominal", "expert")
         ]
         assert row(name, *(f"{x:.0f}" for pair in pairs for x in pair)) in page

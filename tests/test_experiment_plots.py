@@ -6,7 +6,7 @@ import numpy as np
 import plots
 import pytest
 
-from hector_jax.control.weights import direction_names, weight_names
+from hector_jax.control.weights import direction_names
 
 RNG = np.random.default_rng(1)
 TRUTH = RNG.normal(size=18) + 0.1 * RNG.normal(size=(4, 18))
@@ -22,25 +22,6 @@ class Result(NamedTuple):
 def lines(axes):
     """Data of an axes' lines by their label."""
     return {line.get_label(): np.asarray(line.get_xydata()) for line in axes.lines}
-
-
-def test_tuning_while_walking_is_drawn_with_walks_that_ended_early(tmp_path, drawn):
-    times = 0.4 * np.arange(1, 21)
-    arms = {"fixed": np.array([[1.0], [3.0], [9.0]]), "carried": np.ones((3, 1))}
-    curves = {
-        (name, "nominal"): {arm: 1e6 * x * np.ones((3, 20)) for arm, x in arms.items()}
-        for name in ("straight", "s")
-    }
-    plots.while_walking(tmp_path / "loss.png", 4.0, times, curves)
-    assert set(lines(drawn[0].axes[0])["weights stay"][:, 1]) == {3.0}
-    assert drawn[0].axes[0].get_ylabel() == "L of 0.4 s [10$^6$]"
-    ratios = np.exp(np.linspace(0.0, 1.0, 20)[:, None] * np.linspace(-1, 1, len(weight_names())))
-    plots.weight_histories(
-        tmp_path / "weights.png", 4.0, times, weight_names(), {"straight": ratios, "c": ratios[:7]}
-    )
-    straight, c = (lines(axes) for axes in drawn[1].axes)
-    np.testing.assert_allclose(straight["Q roll"][:, 1], ratios[:, 0])  # it moved most
-    assert len(c["Q roll"]) == 7
 
 
 def test_sets_of_batches_stand_at_their_ratio_and_in_the_order_of_their_losses(tmp_path, drawn):

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-import table_plots
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
-from pretend import elsewhere, pretend_history, pretend_verdict, pretend_walk
+from pretend import elsewhere, pretend_history, pretend_walk
 
 from hector_jax.control.weights import weight_names
 from hector_jax.core.trajectory import State
@@ -98,19 +97,8 @@ def test_the_four_sets_of_most_pictures_stay_apart_in_grey():
 
 
 def test_a_legend_begins_with_the_names_of_the_tables():
-    for name in (*FOUR, "search_200", "shared_mean", "search_2000", "mine"):
+    for name in (*FOUR, "shared_mean", "search_2000", "mine"):
         assert label_of(name).split(" (")[0] == name
-
-
-def test_the_collective_figure_has_the_four_sets_and_the_long_search(tmp_path, drawn, walks):
-    more = {name: walks["expert"] for name in ("search_200", "shared_mean", "search_2000")} | walks
-    caption = table_plots.collective(tmp_path / "more.png", more, None)
-    assert "of nominal, expert, without, with," in caption
-    path, *panels = drawn[0].axes
-    drawn_lines = {label for label in lines(path) if not label.endswith("set down")}
-    assert drawn_lines == {label_of(name) for name in (*FOUR, "search_2000")} | {"reference"}
-    for panel in panels:
-        assert {label for label in lines(panel) if label[0] != "_"} == set(map(label_of, FOUR))
 
 
 def test_the_path_of_a_straight_walk_is_a_flat_picture(tmp_path):
@@ -132,42 +120,6 @@ def test_a_straight_path_has_room_for_its_legend_and_labels(tmp_path, drawn, pai
         box = text.get_window_extent()
         assert box.y0 >= 0.0
         assert box.y1 <= figure.bbox.y1
-
-
-@pytest.mark.parametrize("turn", [0.0, 0.8])
-def test_the_collective_figure_goes_with_and_without_snapshots(tmp_path, drawn, turn):
-    """A straight path lies across, a bent one stands beside the panels."""
-    walks = {name: pretend_walk(seconds=2.0, turn=turn) for name in ("nominal", "with")}
-    Image.new("RGB", (600, 200), "grey").save(tmp_path / "strip.png")
-    table_plots.collective(tmp_path / "without.png", walks, None)
-    caption = table_plots.collective(tmp_path / "with.png", walks, tmp_path / "strip.png")
-    assert caption.startswith("Snapshots; ")
-    without, with_ = drawn
-    assert with_.axes[0].images
-    assert with_.get_figheight() > without.get_figheight() + 3.0
-    path, first, *_ = (axes.get_window_extent() for axes in without.axes)
-    assert (path.y0 > first.y1) if turn == 0.0 else (path.x1 < first.x0)
-
-
-def test_falls_stand_at_the_edge_of_changes_and_do_not_squeeze_the_axis(tmp_path, drawn):
-    one, other = pretend_verdict(8), pretend_verdict(8, fallen={("with", 1), ("with", 3)})
-    for verdict in (one, other):
-        verdict.scores["with"].L[[1, 3]] *= 1 + 200 * verdict.scores["with"].fallen[[1, 3]]
-    other.scores["mine"] = other.scores["without"]
-    paper = {("c", "without", "nominal"): -68.7}
-    table_plots.changes(tmp_path / "changes.png", {"c": one, "s": other}, paper)
-    c, s, *_ = drawn[0].axes
-    assert [text.get_text() for text in s.texts] == ["2 fell"]
-    assert not c.texts
-    assert s.get_xlim()[1] < 2.0
-    rows = [label.get_text() for label in c.get_yticklabels()]
-    assert rows[-2:] == ["with (tuned, net)", "mine"]
-    dots = [line.get_xdata() for line in s.lines if line.get_marker() == "o"]
-    ratio = other.scores["with"].L / other.scores["nominal"].L
-    assert any(np.array_equal(x, ratio[~other.scores["with"].fallen]) for x in dots)
-    diamonds = next(line for line in c.lines if line.get_marker() == "D")
-    np.testing.assert_allclose(diamonds.get_xydata(), [[0.313, rows.index(label_of("without"))]])
-    assert c.get_xlabel() == "change of L against nominal [%]"
 
 
 def test_the_loss_by_iteration_shows_refused_steps_that_are_no_numbers(tmp_path, drawn):
