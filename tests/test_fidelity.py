@@ -102,7 +102,7 @@ def test_the_report_holds_every_world_and_phi(tmp_path, samples, drifts):
         errors_by_phi(effects, samples), fidelity.by_phase(effects, samples), drifts
     )
     worlds = {"hfs": found, "standin": found}
-    text = fidelity.write_report(tmp_path, worlds, [Picture("a.png", "A picture.")]).read_text()
+    text = fidelity.write_net_report(tmp_path, worlds, [Picture("a.png", "A picture.")]).read_text()
     assert "## hfs" in text
     assert "## hardware stand-in" in text
     assert "![A picture.](a.png)" in text
@@ -126,7 +126,7 @@ def test_what_nothing_was_measured_of_is_null_and_a_dash(tmp_path, robot, sample
         fidelity.by_phase(effects, some),
         {n: fidelity.drift(robot, e, fell, np.zeros(1, int)) for n, e in phis.items()},
     )
-    text = fidelity.write_report(tmp_path, {"hfs": found}, []).read_text()
+    text = fidelity.write_net_report(tmp_path, {"hfs": found}, []).read_text()
     assert "| last 50 ms, stance, F [N^2] | - |" in text
     assert "nan" not in text
     told = json.loads((tmp_path / "result.json").read_text())["hfs"]

@@ -13,7 +13,7 @@ from hector_jax.grfm.nets import History
 from hector_jax.report import plots
 from hector_jax.report.fidelity import Drift
 from hector_jax.report.motion import motions
-from hector_jax.report.plots import distances, style
+from hector_jax.report.plots import save_distances, style
 from hector_jax.report.plots.style import SETS, label_of, looks_of
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.loss import PAPER_LOSS
@@ -40,8 +40,8 @@ def legend_of(figure):
 def test_errors_and_paths_do_not_depend_on_where_a_walk_began(tmp_path, drawn, walks):
     one = walks["with"]
     pair = {"with": one, "nominal": elsewhere(one, (0.4, -1.0), 2.0)}
-    plots.tracking(tmp_path / "a.png", pair)
-    caption = plots.path_from_above(tmp_path / "b.png", pair)
+    plots.save_tracking(tmp_path / "a.png", pair)
+    caption = plots.save_path(tmp_path / "b.png", pair)
     assert "one reference" in caption
     for axes in [*drawn[0].axes, *drawn[1].axes]:
         found = lines(axes)
@@ -55,7 +55,7 @@ def test_the_errors_are_along_and_across_the_heading_in_centimetres_and_degrees(
     yaw = walk.reference.euler[:, 2]
     left = 0.02 * np.stack([-np.sin(yaw), np.cos(yaw), 0 * yaw], axis=1)
     state = State(walk.state.euler + [0.0, 0.1, 0.0], walk.state.position + left, *walk.state[2:])
-    plots.tracking(tmp_path / "a.png", {"with": walk._replace(state=state)})
+    plots.save_tracking(tmp_path / "a.png", {"with": walk._replace(state=state)})
     found = {axes.get_ylabel(): axes.lines[0].get_ydata() for axes in drawn[0].axes}
     assert [label.split(" [")[1] for label in found] == ["cm]"] * 3 + ["deg]"] * 3
     expected = [0.0, 2.0, 0.0, 0.0, np.rad2deg(0.1), 0.0]
@@ -65,8 +65,8 @@ def test_the_errors_are_along_and_across_the_heading_in_centimetres_and_degrees(
 
 def test_lines_end_at_a_fall(tmp_path, drawn, walks):
     fallen = walks | {"without": pretend_walk(2, seconds=1.0, fall_at=0.6)}
-    plots.tracking(tmp_path / "tracking.png", fallen)
-    plots.path_from_above(tmp_path / "path.png", fallen)
+    plots.save_tracking(tmp_path / "tracking.png", fallen)
+    plots.save_path(tmp_path / "path.png", fallen)
     for axes in [*drawn[0].axes, *drawn[1].axes]:
         up = np.isfinite(lines(axes)["without (tuned, no net)"][:, 1])
         assert up.tolist() == [True] * 60 + [False] * 40
@@ -74,7 +74,7 @@ def test_lines_end_at_a_fall(tmp_path, drawn, walks):
 
 def test_below_a_film_stand_the_distances_and_where_the_axes_are(tmp_path, drawn, walks):
     pair = motions(load_robot(), {name: walks[name] for name in ("nominal", "with")})
-    box = distances(tmp_path / "a.png", pair, 800, 132)
+    box = save_distances(tmp_path / "a.png", pair, 800, 132)
     with Image.open(tmp_path / "a.png") as picture:
         assert picture.size == (800, 132)
         inside = np.asarray(picture.convert("RGB"))[box[1] : box[3], box[0] : box[2]]
@@ -102,7 +102,7 @@ def test_a_legend_begins_with_the_names_of_the_tables():
 
 
 def test_the_path_of_a_straight_walk_is_a_flat_picture(tmp_path):
-    plots.path_from_above(tmp_path / "path.png", {"with": pretend_walk(seconds=4.0)})
+    plots.save_path(tmp_path / "path.png", {"with": pretend_walk(seconds=4.0)})
     with Image.open(tmp_path / "path.png") as picture:
         assert picture.height < picture.width / 2
 
@@ -113,7 +113,7 @@ def test_a_straight_path_has_room_for_its_legend_and_labels(tmp_path, drawn, pai
     walk = pretend_walk(seconds=4.0)
     more = {name: np.repeat(getattr(walk, name), pairs, axis=1) for name in ("contact", "feet")}
     names = ("nominal", "expert", "with", "best")
-    plots.path_from_above(tmp_path / "path.png", dict.fromkeys(names, walk._replace(**more)))
+    plots.save_path(tmp_path / "path.png", dict.fromkeys(names, walk._replace(**more)))
     (figure,) = drawn
     (axes,) = figure.axes
     for text in (axes.xaxis.label, axes.yaxis.label, *figure.legends):
@@ -124,7 +124,7 @@ def test_a_straight_path_has_room_for_its_legend_and_labels(tmp_path, drawn, pai
 
 def test_the_loss_by_iteration_shows_refused_steps_that_are_no_numbers(tmp_path, drawn):
     histories = {"without": pretend_history(12), "with": pretend_history(8, refused=(3, 5))}
-    plots.losses(tmp_path / "loss.png", PAPER_LOSS, histories)
+    plots.save_losses(tmp_path / "loss.png", PAPER_LOSS, histories)
     whole = drawn[0].axes[0]
     kept = [0, 1, 2, 4, 6, 7, 8]
     expected = [histories["with"][i].evaluation.loss / 1e6 for i in kept]
@@ -137,8 +137,8 @@ def test_the_loss_by_iteration_shows_refused_steps_that_are_no_numbers(tmp_path,
 def test_bars_are_the_weights_over_the_nominal_ones(tmp_path, drawn):
     nominal = np.geomspace(1e-4, 100, len(weight_names()))
     sets = {"nominal": nominal, "without": 2 * nominal, "with": nominal / 4}
-    plots.weights(tmp_path / "few.png", weight_names(), sets)
-    plots.weights(tmp_path / "all.png", weight_names(), sets | {"expert": 3 * nominal})
+    plots.save_weights(tmp_path / "few.png", weight_names(), sets)
+    plots.save_weights(tmp_path / "all.png", weight_names(), sets | {"expert": 3 * nominal})
     tops = [bar.get_y() + bar.get_height() for bar in drawn[0].axes[0].patches]
     np.testing.assert_allclose(tops, [2.0] * 24 + [0.25] * 24)
     np.testing.assert_allclose(lines(drawn[1].axes[0])["expert"][:, 1], 3.0)
@@ -147,7 +147,7 @@ def test_bars_are_the_weights_over_the_nominal_ones(tmp_path, drawn):
 def test_wrenches_are_those_of_the_left_foot(tmp_path, drawn, walks):
     walk = walks["with"]
     curves = {"commanded": walk.command, "measured": walk.effect}
-    assert "left foot" in plots.wrenches(tmp_path / "a.png", 0.01, curves)
+    assert "left foot" in plots.save_wrenches(tmp_path / "a.png", 0.01, curves)
     up = drawn[0].axes[2]
     assert up.get_ylabel() == "$F_z$ [N]"
     found = {step.get_label(): step.get_data().values for step in up.patches}
@@ -158,12 +158,12 @@ def test_wrenches_are_those_of_the_left_foot(tmp_path, drawn, walks):
 def test_the_epoch_of_the_least_error_on_the_validation_walks_is_marked(tmp_path, drawn):
     falling = np.geomspace(300.0, 60.0, 50)
     held = np.r_[falling[:30] + 5, falling[29] + np.arange(5.0, 25.0)]
-    plots.training(tmp_path / "net.png", History(falling, falling / 300, held, falling / 250))
+    plots.save_training(tmp_path / "net.png", History(falling, falling / 300, held, falling / 250))
     force, moment = drawn[0].axes
     assert lines(force)["least"].tolist() == [[30.0, held[29]]]
     assert "N$^2$" in force.get_ylabel()
     assert "(N m)$^2$" in moment.get_ylabel()
-    plots.training(tmp_path / "net.png", History(falling, 0 * falling, held, 0 * falling))
+    plots.save_training(tmp_path / "net.png", History(falling, 0 * falling, held, 0 * falling))
     assert len(drawn[1].axes) == 1  # point feet have no moments
 
 
@@ -171,7 +171,7 @@ def test_open_loop_errors_have_a_row_for_each_world(tmp_path, drawn):
     time = np.linspace(0.01, 0.4, 40)
     names = ("raw", "linear", "paper", "residual", "gated", "measured", "mine")
     found = {n: Drift(time, 0.1 * time**2 / i, time / i) for i, n in enumerate(names, 1)}
-    plots.open_loop(tmp_path / "a.png", {"hfs": found, "hardware stand-in": found})
+    plots.save_open_loop(tmp_path / "a.png", {"hfs": found, "hardware stand-in": found})
     rows = [axes.get_title() for axes in drawn[0].axes]
     assert rows == ["hfs"] * 2 + ["hardware stand-in"] * 2
     np.testing.assert_allclose(lines(drawn[0].axes[0])["measured"][:, 1], 10 * time**2 / 6)
@@ -194,7 +194,7 @@ def test_the_same_picture_gives_the_same_bytes(tmp_path, walks, ending):
     pictures = []
     for i in range(2):
         path = tmp_path / f"{i}.{ending}"
-        plots.path_from_above(path, walks)
+        plots.save_path(path, walks)
         pictures.append(path.read_bytes())
     assert pictures[0] == pictures[1]
 

@@ -13,7 +13,7 @@ from hector_jax.control.weights import expert
 from hector_jax.core.environment import environment
 from hector_jax.report import report
 from hector_jax.report.report import Picture, print_table
-from hector_jax.report.run import tuning_section, write_report
+from hector_jax.report.run import tuning_section, write_run_report
 from hector_jax.tuning.curvature import Determined, Direction
 from hector_jax.tuning.status import StepStatus, Stop
 from hector_jax.walk_tuning.walks import Change
@@ -103,7 +103,7 @@ def test_legs_that_touch_are_told_where_they_do(tmp_path):
     verdict = verdict._replace(scores=scores)
     line = "The legs touched each other, which is no fall: with 0.030 s in all."
     assert line in _printed(verdict)
-    assert line in write_report(tmp_path, **_report(verdict)).read_text()
+    assert line in write_run_report(tmp_path, **_report(verdict)).read_text()
 
 
 def test_the_table_goes_without_baselines_that_were_not_walked():
@@ -137,11 +137,11 @@ def test_walks_on_several_trajectories_are_not_counted_as_plants(tmp_path):
     assert first.endswith("; means over 4 plants and 3 trajectories (seeds 0-3).")
     assert "median over plants and trajectories of the paired ratio" in second
     assert "intervals redraw the plants" in second
-    text = write_report(tmp_path, **_report(verdict)).read_text()
+    text = write_run_report(tmp_path, **_report(verdict)).read_text()
     assert "the robot fell in 3 of 12 walks (4 plants, 3 trajectories)." in text
     assert "| 3 / 12 |" in text
     assert "12 plants" not in text
-    text = write_report(tmp_path, **_report(pretend_verdict(4, {("with", 0)}))).read_text()
+    text = write_run_report(tmp_path, **_report(pretend_verdict(4, {("with", 0)}))).read_text()
     assert "the robot fell on 1 of 4 plants." in text
     assert "| 1 / 4 |" in text
     assert "trajectories" not in text
@@ -170,7 +170,7 @@ def test_a_row_of_falls_leaves_the_others_their_digits(numbers, texts):
 
 
 def test_the_report_tells_everything_that_was_promised(tmp_path):
-    path = write_report(tmp_path, **_report())
+    path = write_run_report(tmp_path, **_report())
     assert "| `Q_pitch` against `Q_x` | 25.0 | 96 |" in path.read_text()
     text = path.read_text()
     assert path == tmp_path / "report.md"
@@ -202,20 +202,20 @@ def test_the_report_opens_with_errors_falls_and_what_to_do_next(tmp_path):
     assert f"{of['pitch']:.1f} degrees in pitch (RMS); nominal " in lines[0]
     assert lines[1].endswith("the tuning has not seen: with 0, nominal 0, expert 1.")
     assert all(f"`hector {name} latest`" in lines[2] for name in ("view", "export"))
-    text = write_report(tmp_path, **_report(verdict)).read_text()
+    text = write_run_report(tmp_path, **_report(verdict)).read_text()
     assert text.split("\n\n")[1:4] == lines
     assert text.split("\n\n")[4].startswith("| RMS error | in the plane [cm] |")
 
 
 def test_the_report_names_the_iteration_that_was_taken_and_the_errors_of_touchdowns(tmp_path):
-    plain = write_report(tmp_path, **_report()).read_text()
+    plain = write_run_report(tmp_path, **_report()).read_text()
     assert "touchdown" not in plain
     assert "`best` minimises the mean of L / L(start) over 4 drawn models" in plain
     assert "cost 11 times as much, plus 0.003 / 2 times the squared log-steps" in plain
     assert "the iteration that walks best on 4 plants drawn around the hfs" in plain
     report = _report()
     errors = {name: one | {"touchdown": [9.0, 4.0]} for name, one in report["errors"].items()}
-    text = write_report(tmp_path, **(report | {"errors": errors})).read_text()
+    text = write_run_report(tmp_path, **(report | {"errors": errors})).read_text()
     assert text.count("- taken: iteration 3\n") == 1
     assert "| touchdown, sideways [cm^2] | 4 | 4 | 4 |" in text
 
@@ -223,7 +223,7 @@ def test_the_report_names_the_iteration_that_was_taken_and_the_errors_of_touchdo
 def test_the_report_has_the_weight_of_each_term_of_the_loss(tmp_path):
     verdict = pretend_verdict()
     weighed = (*verdict.loss[:2], verdict.loss[2]._replace(weight=0.623))  # a robot's own
-    text = write_report(tmp_path, **_report(verdict._replace(loss=weighed))).read_text()
+    text = write_run_report(tmp_path, **_report(verdict._replace(loss=weighed))).read_text()
     assert "This run: 1e5, 2e5, 0.623." in text
     assert "| alpha_3 L_ctrl |" in text
 
@@ -234,7 +234,7 @@ def test_every_table_of_the_report_is_well_formed(tmp_path):
         "best_proposal": "set 1",
         "cases": 6,
     }
-    text = write_report(tmp_path, **report).read_text()
+    text = write_run_report(tmp_path, **report).read_text()
     for block in text.split("\n\n"):
         rows = [row for row in block.splitlines() if row.startswith("|")]
         assert len({row.count("|") for row in rows}) <= 1, block
@@ -246,13 +246,13 @@ def test_the_report_says_below_only_where_the_loss_is_below(tmp_path):
     verdict = pretend_verdict()
     swapped = {"nominal": "with", "with": "nominal"}
     scores = {name: verdict.scores[swapped.get(name, name)] for name in SETS}
-    text = write_report(tmp_path, **_report(verdict._replace(scores=scores))).read_text()
+    text = write_run_report(tmp_path, **_report(verdict._replace(scores=scores))).read_text()
     assert "(`with`), the loss is 174" in text
     assert "% above nominal" in text
 
 
 def test_the_film_is_linked_where_there_is_one(tmp_path):
-    text = write_report(
+    text = write_run_report(
         tmp_path, **_report(film=Picture("film.mp4", "Before and after."))
     ).read_text()
     assert "[Before and after.](film.mp4)" in text
@@ -271,15 +271,15 @@ def test_the_report_says_what_was_tuned_beside_the_weights():
 
 def test_a_tuning_on_walks_shows_each_set_and_its_falls(tmp_path):
     report = _report() | {"proposals": WALKED, "best_proposal": "set 1", "cases": 6}
-    text = write_report(tmp_path, **report).read_text()
+    text = write_run_report(tmp_path, **report).read_text()
     assert "Each weight set was walked 6 times" in text
     assert "the one that walks best there is `best`: set 1." in text
     assert "| 0, start |  | +0.0 |" in text
     assert "| 1, model | -12.3 | -10.0 |" in text
     assert "| 2, model | -5.0 | fell |" in text
-    assert "Tuning on walks" not in write_report(tmp_path, **_report()).read_text()
+    assert "Tuning on walks" not in write_run_report(tmp_path, **_report()).read_text()
 
 
 def test_a_report_says_what_changes_of_the_command_cost_in_best(tmp_path):
     words = "changes of the command between switches of stance cost 4 times as much"
-    assert words in write_report(tmp_path, **_report() | {"smooth": 3.0}).read_text()
+    assert words in write_run_report(tmp_path, **_report() | {"smooth": 3.0}).read_text()

@@ -168,7 +168,7 @@ def test_the_report_has_a_page_its_numbers_and_a_picture(tmp_path, drawn):
     cells = {(c, t): cell(4) for c in (C, HEAVY, DRAKE) for t in ("straight", "s")}
     cells[HEAVY, "s"] = fell
     facts = {"config": {}, "environment": {"python": "3"}, "command": "hector verdict"}
-    report.write_report(
+    report.write_verdict_report(
         tmp_path, cells, family="even", differs={"drake": "dry friction is smooth"}, **facts
     )
     page = (tmp_path / "report.md").read_text()
@@ -198,7 +198,7 @@ def test_the_report_has_a_page_its_numbers_and_a_picture(tmp_path, drawn):
 
 def test_an_interval_beyond_the_edge_of_the_picture_ends_at_the_edge(tmp_path, drawn):
     cells = {(C, "s"): cell(tuned=40e6)}  # ten times nominal
-    plots.matrix(tmp_path / "verdict.png", cells, report.title_of)
+    plots.save_matrix(tmp_path / "verdict.png", cells, report.title_of)
     ends = np.concatenate([line.get_xdata() for line in drawn[0].axes[0].lines])
     assert ends.max() == 60.0
 

@@ -199,7 +199,7 @@ def grfm(args: Grfm) -> None:
     trainings = {"training": net.history, "training_paper": paper.history}
     tick = config.rollout.walk.gait.tick
     drawings = pictures.of_nets(args.out, tick, curves, drifts, trainings)
-    report = fidelity.write_report(args.out, result, drawings)
+    report = fidelity.write_net_report(args.out, result, drawings)
     print_text = partial(arguments.print_errors, result["hfs"]["errors"])
     print_result(args.json, {"report": str(report), "worlds": result}, print_text)
     say(f"the report is {report}")

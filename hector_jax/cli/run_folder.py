@@ -1,6 +1,7 @@
 """The folder of a run of `hector tune`: create it with its flags, and resume it."""
 
 import dataclasses
+import json
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -15,7 +16,7 @@ from hector_jax.control.controller import walk_config
 from hector_jax.control.parameters import leg_numbers
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.core.environment import code_hash, environment
-from hector_jax.core.files import make_folder, write_json
+from hector_jax.core.files import as_json, make_folder, write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.settings import convert
 from hector_jax.robot.model import Robot, load_robot
@@ -166,6 +167,21 @@ def check_agreement(folder: Path, recorded: Mapping[str, Any], current: Mapping[
     for name, value in flattened(current).items():
         if old.get(name, value) != value:
             raise InputError(f"{folder}: begun with {name} {old[name]}, here is {value}")
+
+
+def note_settings(folder: Path, settings: dict[str, Any]) -> dict[str, Any]:
+    """Add resolved settings to config.json and return all that is in it.
+
+    Raises:
+        InputError: they differ from those recorded when the run was begun.
+    """
+    path = folder / CONFIG
+    recorded, as_read = read_object(path), json.loads(as_json(settings))
+    check_agreement(folder, recorded, as_read)
+    if recorded.get("start", as_read["start"]) != as_read["start"]:  # a number added or removed
+        raise InputError(f"{folder}: begun with a start of other numbers beside Q and R")
+    write_json(path, recorded | settings)
+    return recorded | settings
 
 
 def by_folder(args: Tune, base: Path | None, robot: Robot) -> dict[Path, Tune]:

@@ -1,6 +1,5 @@
 """`hector tune`: tune weights with and without the net, evaluate them, and write a run folder."""
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -24,14 +23,14 @@ from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import save_weights, weights_tree
 from hector_jax.core.console import say
 from hector_jax.core.environment import environment
-from hector_jax.core.files import as_json, locked, write_json
+from hector_jax.core.files import locked, write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.network import as_effect
 from hector_jax.report import fidelity, pictures
 from hector_jax.report.report import Picture, first_lines, print_table
-from hector_jax.report.run import write_report
+from hector_jax.report.run import write_run_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.diagnosis import fall_of
@@ -40,7 +39,7 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
 from hector_jax.store import nets, tunings
-from hector_jax.store.folder import CONFIG, METRICS, RESULT, VERSIONS, read_object
+from hector_jax.store.folder import METRICS, RESULT, VERSIONS
 from hector_jax.store.setup import Setup
 from hector_jax.tuning.curvature import Determined, determined
 from hector_jax.tuning.difftune import TuneConfig, Tuning
@@ -183,7 +182,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     result, by_name = _result(run, tuned, walks, known)
     write_json(folder / VERSIONS, made_with | {"seconds": f"{time.monotonic() - start_time:.0f}"})
     name_of_run = "latest" if Path("runs").resolve() in folder.resolve().parents else str(folder)
-    report = write_report(
+    report = write_run_report(
         folder,
         run=name_of_run,
         trajectory=run.name,
@@ -239,8 +238,6 @@ def _check_start(
 
 def _note_settings(run: _Run) -> dict[str, Any]:
     """Add the resolved settings to config.json; InputError if they differ from those recorded."""
-    path = run.folder / CONFIG
-    recorded = read_object(path)
     as_lists = partial(jax.tree.map, lambda x: np.asarray(x).tolist())
     commands = [as_lists(command)._asdict() for command in run.commands.values()]
     settings = {
@@ -251,13 +248,7 @@ def _note_settings(run: _Run) -> dict[str, Any]:
         "start": weights_tree(run.start),
         "choice_plants": run.setup.robot.description.tuning.choice_plants,
     }
-    as_read = json.loads(as_json(settings))
-    run_folder.check_agreement(run.folder, recorded, as_read)
-    if recorded.get("start", as_read["start"]) != as_read["start"]:  # a number added or removed
-        raise InputError(f"{run.folder}: begun with a start of other numbers beside Q and R")
-    settings = recorded | settings
-    write_json(path, settings)
-    return settings
+    return run_folder.note_settings(run.folder, settings)
 
 
 def _tune_sets(run: _Run) -> _Tuned:

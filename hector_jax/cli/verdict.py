@@ -66,7 +66,7 @@ def verdict(args: Verdict) -> None:
     with workers(args.processes) as pool:
         setup = Setup(pool, config, plan.robot, made_with.get("commit", ""))
         cells = walk_cells(setup, plan, args.out / "scores")
-    result = report.write_report(
+    result = report.write_verdict_report(
         args.out,
         cells,
         family=args.family,

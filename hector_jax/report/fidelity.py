@@ -202,7 +202,7 @@ def curves(
     return {name: jax.tree.map(by_tick, wrench) for name, wrench in wrenches.items()}
 
 
-def write_report(
+def write_net_report(
     folder: Path, worlds: Mapping[str, Mapping[str, Any]], pictures: Sequence[Picture]
 ) -> Path:
     """Write report.md on the nets' prediction errors, and the same numbers as result.json.

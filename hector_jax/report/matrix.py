@@ -120,7 +120,7 @@ def print_verdict(cells: Cells, differs: Mapping[str, str], family: str) -> None
         print(line)
 
 
-def write_report(
+def write_verdict_report(
     folder: Path,
     cells: Cells,
     *,
@@ -147,7 +147,7 @@ def write_report(
         "environment": dict(environment),
     }
     result = matrix.matrix_result(cells, family) | {"differs": dict(differs), **contents}
-    picture = Picture("verdict.png", plots.matrix(folder / "verdict.png", cells, title_of))
+    picture = Picture("verdict.png", plots.save_matrix(folder / "verdict.png", cells, title_of))
     text = render(
         "matrix.md.j2",
         **contents,

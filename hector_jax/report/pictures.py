@@ -53,12 +53,12 @@ def of_run(
     path, tick = folder / "pictures", config.rollout.walk.gait.tick
     path.mkdir(exist_ok=True)
     captions = {
-        "tracking": plots.tracking(path / "tracking.png", walks),
-        "path": plots.path_from_above(path / "path.png", walks),
-        "losses": plots.losses(path / "losses.png", config.loss, histories),
-        "weights": plots.weights(path / "weights.png", weight_names(sets["nominal"]), vectors),
-        "wrenches": plots.wrenches(path / "wrenches.png", tick, ground),
-        "training": plots.training(path / "training.png", training),
+        "tracking": plots.save_tracking(path / "tracking.png", walks),
+        "path": plots.save_path(path / "path.png", walks),
+        "losses": plots.save_losses(path / "losses.png", config.loss, histories),
+        "weights": plots.save_weights(path / "weights.png", weight_names(sets["nominal"]), vectors),
+        "wrenches": plots.save_wrenches(path / "wrenches.png", tick, ground),
+        "training": plots.save_training(path / "training.png", training),
     }
     return [Picture(f"pictures/{name}.png", caption) for name, caption in captions.items()]
 
@@ -82,12 +82,12 @@ def of_nets(
     Returns:
         The pictures, in the order of the report.
     """
-    wrenches = plots.wrenches(folder / "wrenches.png", tick, ground)
+    wrenches = plots.save_wrenches(folder / "wrenches.png", tick, ground)
     worlds = {WORLDS.get(world, world): drift for world, drift in drifts.items()}
     captions = {
         "wrenches": f"{wrenches} The first held-out walk, in the robot's yaw frame.",
-        "open_loop": plots.open_loop(folder / "open_loop.png", worlds),
-        **{name: plots.training(folder / f"{name}.png", x) for name, x in trainings.items()},
+        "open_loop": plots.save_open_loop(folder / "open_loop.png", worlds),
+        **{name: plots.save_training(folder / f"{name}.png", x) for name, x in trainings.items()},
     }
     return [Picture(f"{name}.png", caption) for name, caption in captions.items()]
 
@@ -108,14 +108,14 @@ def of_view(
         VideoUnavailable: this machine cannot make a film.
     """
     walks = {name: viewed.walk for name, viewed in views.items()}
-    plots.tracking(folder / "tracking.png", walks)
-    plots.path_from_above(folder / "path.png", walks)
+    plots.save_tracking(folder / "tracking.png", walks)
+    plots.save_path(folder / "path.png", walks)
     after, ground = list(views.values())[-1]
     period = float(after.period)
     first = min(0.4, period * len(after.fallen))  # [s], two steps
-    plots.wrenches(folder / "wrenches.png", period, ground, seconds=first)
+    plots.save_wrenches(folder / "wrenches.png", period, ground, seconds=first)
     if tunings := {name: histories[name] for name in ("without", "with") if histories.get(name)}:
-        plots.losses(folder / "losses.png", loss, tunings)
+        plots.save_losses(folder / "losses.png", loss, tunings)
     say("making the film")
     pair = motions(robot, plots.style.titled(walks))
     _write(folder / "film.mp4", robot, pair, folder / "film.png")

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from hector_jax.core.headless import mujoco
 from hector_jax.report.motion import INK, Motion
-from hector_jax.report.plots import distances
+from hector_jax.report.plots import save_distances
 from hector_jax.report.video import Scene
 
 _SAMPLE = 0.02  # [s] between the points of the lines on the floor
@@ -38,7 +38,7 @@ def main() -> None:
     if scene.strip:
         _strip(scene, list(views)).save(scene.file)
     else:
-        box = distances(Path("plot.png"), scene.motions, width, height // 4)
+        box = save_distances(Path("plot.png"), scene.motions, width, height // 4)
         plot = np.asarray(Image.open("plot.png").convert("RGB"))
         frames = (_frame(scene, plot, box, halves, k) for k, halves in enumerate(views))
         _encode(scene.file, frames, (width, height), scene.config.rate)

@@ -65,7 +65,7 @@ def number(x: float, form: str = ".3g") -> str:
     return format(x, form) if math.isfinite(x) else "-"
 
 
-class Column(NamedTuple):
+class TableColumn(NamedTuple):
     """Number format of a part of the loss."""
 
     part: str
@@ -87,21 +87,21 @@ class Column(NamedTuple):
         return f"{x / 10.0**self.power:.{self.digits}f}"
 
 
-def column(part: str, *numbers: float) -> Column:
+def column(part: str, *numbers: float) -> TableColumn:
     """Choose a power of a thousand for the middle one, and three digits of the smallest number.
 
     A row of falls, which may be a thousand times as large, decides neither.
     """
     positive = sorted(x for x in numbers if x > 0.0)
     if not positive:
-        return Column(part, 0, 2)
+        return TableColumn(part, 0, 2)
     middle = positive[(len(positive) - 1) // 2]
     power = 0 if 0.1 <= middle < 1e3 else 3 * math.floor(math.log10(middle) / 3)
     digits = 2 - math.floor(math.log10(positive[0] / 10.0**power))
-    return Column(part, power, min(max(digits, 0), 4))
+    return TableColumn(part, power, min(max(digits, 0), 4))
 
 
-def columns(verdict: Verdict) -> dict[str, Column]:
+def columns(verdict: Verdict) -> dict[str, TableColumn]:
     """Choose the number format of each part for the tables of a verdict."""
     means = [summary.means for summary in summaries(verdict).values()]
     return {part: column(part, *(mean[part].value for mean in means)) for part in verdict.parts}

@@ -16,7 +16,7 @@ from hector_jax.tuning.difftune import Iteration, Tuning
 from hector_jax.tuning.evaluate import aligned
 
 
-def write_report(folder: Path, **contents: Any) -> Path:
+def write_run_report(folder: Path, **contents: Any) -> Path:
     """Write report.md into the run folder, whole or not at all.
 
     Args:

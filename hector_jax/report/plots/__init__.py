@@ -29,7 +29,7 @@ from hector_jax.verdict.matrix import Cells, Column, columns_of, sets_of, trajec
 from hector_jax.verdict.metrics import BASELINES, Verdict, compare
 
 
-def tracking(path: Path, walks: Mapping[str, Trajectory]) -> str:
+def save_tracking(path: Path, walks: Mapping[str, Trajectory]) -> str:
     """Draw the errors of position and attitude along each walk.
 
     Args:
@@ -65,7 +65,7 @@ def draw_tracking(panels: np.ndarray, walks: Mapping[str, Trajectory]) -> None:
     setp(panels[-1], xlabel="time [s]")
 
 
-def distances(
+def save_distances(
     path: Path, motions: Mapping[str, Motion], width: int, height: int
 ) -> tuple[int, int, int, int]:
     """Draw the distance from the reference in the plane by time, for the lower part of a film.
@@ -100,7 +100,7 @@ def distances(
     return round(box.x0), round(height - box.y1), round(box.x1), round(height - box.y0)
 
 
-def path_from_above(path: Path, walks: Mapping[str, Trajectory]) -> str:
+def save_path(path: Path, walks: Mapping[str, Trajectory]) -> str:
     """Draw the path of the centre of mass from above, with the footprints of the last set.
 
     Args:
@@ -144,7 +144,7 @@ def draw_path(axes: Axes, walks: Mapping[str, Trajectory]) -> None:
     axes.margins(0.05, 0.1)
 
 
-def losses(path: Path, loss: Loss, histories: Mapping[str, Sequence[Iteration]]) -> str:
+def save_losses(path: Path, loss: Loss, histories: Mapping[str, Sequence[Iteration]]) -> str:
     """Draw the total loss on the model and its parts by iteration.
 
     Args:
@@ -178,7 +178,7 @@ def losses(path: Path, loss: Loss, histories: Mapping[str, Sequence[Iteration]])
     return caption("losses")
 
 
-def weights(
+def save_weights(
     path: Path, names: Sequence[str], sets: Mapping[str, Float[np.ndarray, " weights"]]
 ) -> str:
     """Draw tuned weights as ratios to the nominal ones.
@@ -210,7 +210,7 @@ def weights(
     return caption("weights")
 
 
-def wrenches(
+def save_wrenches(
     path: Path, period: float, curves: Mapping[str, Wrench], *, seconds: float = 0.4
 ) -> str:
     """Draw the commanded, predicted and measured wrench of the first foot over the first steps.
@@ -243,7 +243,7 @@ def wrenches(
     return caption("wrenches", side=FEET[feet][0].replace("_", " "))
 
 
-def open_loop(path: Path, worlds: Mapping[str, Mapping[str, Drift]]) -> str:
+def save_open_loop(path: Path, worlds: Mapping[str, Mapping[str, Drift]]) -> str:
     """Draw the open-loop prediction errors of the rigid body by time ahead.
 
     Args:
@@ -263,7 +263,7 @@ def open_loop(path: Path, worlds: Mapping[str, Mapping[str, Drift]]) -> str:
     return caption("open_loop")
 
 
-def training(path: Path, history: History) -> str:
+def save_training(path: Path, history: History) -> str:
     """Draw the errors of the net by epoch, on the training and on the validation walks.
 
     Args:
@@ -287,7 +287,7 @@ def training(path: Path, history: History) -> str:
     return caption("training")
 
 
-def matrix(path: Path, cells: Cells, title_of: Callable[[Column], str]) -> str:
+def save_matrix(path: Path, cells: Cells, title_of: Callable[[Column], str]) -> str:
     """Draw the change of L of every set against nominal, a row for each engine and model.
 
     Args:
