@@ -175,10 +175,8 @@ def _tune_in(folder: Path, args: Tune) -> None:
         show = None
         if args.verdict:
             show = small_verdict(run.setup, tuned.sets, first, run.seconds, elsewhere)
-    config = run.setup.config
-    known = determined(
-        tuned.tunings["with"].precision, config.ridge, step_names(run.start, config.others)
-    )
+    config, precision = run.setup.config, tuned.tunings["with"].precision
+    known = determined(precision, config.ridge, step_names(run.start, config.others))
     result, by_name = _result(run, tuned, walks, known)
     write_json(folder / VERSIONS, made_with | {"seconds": f"{time.monotonic() - start_time:.0f}"})
     name_of_run = "latest" if Path("runs").resolve() in folder.resolve().parents else str(folder)
@@ -223,9 +221,8 @@ def _check_start(
         InputError: the robot falls; the line has the likeliest cause and what to change.
     """
     robot, case = setup.robot, (text if text in BASELINES else "start", 0)
-    plant = hfs(robot.description)
     for name, command, seconds in trajectories:
-        job = Job(start, command, plant, seconds or Walk.seconds)
+        job = Job(start, command, hfs(robot.description), seconds or Walk.seconds)
         options = {"title": f"walking {name} with the weights to start from", "folder": folder}
         walks = judging.score_jobs(setup, {case: job}, **options, with_walk=[case])
         if walks[case][0].score.fallen:
