@@ -246,13 +246,6 @@ def exported() -> Arrays:
     return {"call": _flat([out["force"], out["moment"], out["torque"]])}
 
 
-def _numbers(tree: Any, name: str = "") -> Arrays:
-    if isinstance(tree, dict):
-        rows = [_numbers(value, f"{name}.{key}") for key, value in tree.items()]
-        return {key: value for row in rows for key, value in row.items()}
-    return {} if tree is None or isinstance(tree, str | list) else {name[1:]: float(tree)}
-
-
 SECTIONS: dict[str, Section] = {
     "qp": (qp, 1e-12),
     "tick": (tick, 1e-12),

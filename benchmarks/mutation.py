@@ -39,9 +39,8 @@ PARTS = {
     ),
     "tuning": (
         "tuning/batch tuning/difftune tuning/step_rules tuning/curvature tuning/loss"
-        " tuning/grounded tuning/rollout tuning/evaluate search/cmaes",
-        "loss variation config rollout difftune step_rules curvature faults measured online search"
-        " batch",
+        " tuning/grounded tuning/rollout tuning/variation tuning/evaluate search/cmaes",
+        "loss variation config rollout difftune step_rules curvature faults grounded search batch",
     ),
     "sim": (
         "sim/actuators sim/loop sim/mjx_model sim/parallel sim/sensing sim/walk sim/world",
@@ -168,7 +167,8 @@ def _copy(root: Path, folder: Path) -> None:
 
 def _exit_code(part: str, folder: Path, core: int, limit: float) -> int:
     files = [f"tests/test_{name}.py" for name in PARTS[part][1].split()]
-    files = [name for name in files if (folder / name).exists()]
+    if missing := [name for name in files if not (folder / name).exists()]:
+        raise FileNotFoundError(f"{', '.join(missing)}: named in PARTS, and not there")
     words = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *files]
     environment = os.environ | {"PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
     with (folder / "log").open("w") as log:

@@ -54,6 +54,8 @@ PACKAGES = {  # in this order: title and purpose of each page of the reference
     "search": ("Search", "Tuning by walks on a simulator, without derivatives."),
     "store": ("Store", "What is computed once and kept: nets, tunings, the folder of a run."),
     "verdict": ("Verdict", "Walks of weight sets, scores and their statistics."),
+    "importing": ("Importing", "The settings of robots that others publish, by rules."),
+    "walk_tuning": ("Tuning on walks", "Proposals, logs of walks and their record."),
     "export": ("Export", "Weights and controller as files for a robot's computer."),
     "report": ("Report", "Tables, pictures, films and pages of a run."),
 }
@@ -67,6 +69,8 @@ PUBLIC = {  # of packages without `__all__`, in whichever of their modules they 
     "search": "SearchConfig search",
     "store": "load_run",
     "verdict": "Score score Verdict make_verdict",
+    "importing": "propose_robot standard_form",
+    "walk_tuning": "Campaign tune_on_walks",
     "export": "export",
     "report": "compare_runs write_film",
 }

@@ -118,17 +118,6 @@ def starts(path: Path, curves: Float[np.ndarray, "starts iterations"]) -> str:
     return "Loss on the model by iteration from each start, and the losses at the end in order."
 
 
-ARMS = {  # what happens to the weights along a walk
-    "fixed": "weights stay",
-    "until": "tuned until the change",
-    "carried": "tuned all the way",
-    "cut": "sensitivities begun anew in each window",
-    "model": "the model's own walk from each window's first state",
-    "plain": "no net: the plain rigid body",
-}
-ARM_LINES = {"fixed": SETS["nominal"], "until": SETS["without"], "carried": SETS["with"]}
-
-
 def race(path: Path, curves: Mapping[str, Mapping[int, Sequence[float]]]) -> str:
     """Draw the loss of the best set so far of each entry: median and range of the repeats.
 

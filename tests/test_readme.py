@@ -20,6 +20,7 @@ BEST = REPORTS / "best"  # evaluations of the sets on each command
 ROBOTS = REPORTS / "robots/robots.json"
 ROBUSTNESS = REPORTS / "robustness/robustness.json"
 RACE = REPORTS / "race/nominal/race.json"
+VERDICT = REPORTS / "verdict" / "verdict.json"
 RUN = REPORTS / "run.json"  # the run whose lines README shows
 
 README = (ROOT / "README.md").read_text()
@@ -102,6 +103,17 @@ def test_the_falls_under_disturbances_are_those_of_their_file():
         assert sum(c[name]["falls"] for c in floor) > sum(c[name]["walks"] for c in floor) / 2
 
 
+def test_the_engines_are_told_as_their_file_has_them():
+    result = json.loads(VERDICT.read_text())
+    assert result["config"]["flags"]["engine"] == ["c", "drake", "pinocchio"]
+    one = result["sets"]["best"]
+    below = [one["against"][base] for base in ("nominal", "expert")]
+    assert f"below plain weights in {below[0]['below']} of {below[0]['cells']} cases" in TEXT
+    assert f"below the laboratory's in {below[1]['below']}, and never falls" in TEXT
+    assert below[1]["below"] == below[1]["cells"]
+    assert one["falls"] == 0 < result["sets"]["nominal"]["falls"]
+
+
 def test_what_a_run_prints_is_what_its_result_says():
     sets = json.loads(RUN.read_text())["sets"]
     each = {name: plain(sets[name]["rms"])[:3] for name in ("best", "nominal", "expert")}
@@ -153,7 +165,7 @@ def test_the_race_is_told_as_its_file_has_it():
     assert f"(from {ours['0']:.2f}, see picture)" in TEXT
     assert cells("Bayesian optimisation")[0] == f"200: {bayes['200']:.2f}"
     assert cells("CMA-ES")[0] == f"200: {evolution:.2f}"
-    assert cells("this")[0].endswith(f"or 5 with `--walks`: {ours['5']:.2f}")
+    assert cells("this")[0].endswith(f"by the method of `--walks`, 5: {ours['5']:.2f}")
     assert ours["5"] < min(bayes["200"], evolution)  # as the picture's words have it
 
 

@@ -117,7 +117,7 @@ def _files(texts: Sequence[str], names: Sequence[str]) -> dict[str, Path]:
 def _check_logs(
     campaign: Campaign, number: int, files: Mapping[str, Path], named: Sequence[str]
 ) -> dict[str, dict[str, Any]]:
-    """Show how the logs track, and refuse those of other walks; returns `walk_log.tracking`.
+    """Show how the logs track, and refuse those of other walks; returns `walk_log.tracking_errors`.
 
     The user said of which trajectory the `named` ones are.
     """

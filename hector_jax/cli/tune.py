@@ -182,7 +182,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     name_of_run = "latest" if Path("runs").resolve() in folder.resolve().parents else str(folder)
     report = write_run_report(
         folder,
-        run=name_of_run,
+        run=str(folder),
         trajectory=run.name,
         verdict=by_name[run.name],
         norms=norms,

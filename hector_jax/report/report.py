@@ -235,5 +235,5 @@ def render(template: str, **values: Any) -> str:
 
 
 def caption(picture: str, **values: Any) -> str:
-    """Return the caption of a picture of `plots` by the name of its function."""
+    """Return the caption of a picture of `plots`, from its macro in captions.j2."""
     return getattr(TEMPLATES.get_template("captions.j2").module, picture)(**values)

@@ -45,9 +45,6 @@ CURVES = {
 """Lines of references and wrenches."""
 CURVES |= {"raw": CURVES["commanded"], "residual": SETS["with"]}
 
-MARK = {"color": "0.5", "linestyle": (0, (2, 2)), "linewidth": 0.9, "zorder": 0}
-"""A line across a panel at an iteration or time."""
-
 _MARKER = {"nominal": "v", "expert": "D", "without": "s", "with": "o", "best": "p"}
 _MARKER |= {"search_2000": "*", "shared_mean": "<", "shared_worst": ">"}
 _SPARE_STYLE = {"linestyle": (0, (2.5, 1, 1, 1, 1, 1)), "linewidth": 1.1}
