@@ -23,11 +23,10 @@ from hector_jax.control.weights_file import save_weights
 from hector_jax.core.files import write_json
 from hector_jax.core.geometry import rot_x, rot_y, rot_z
 from hector_jax.core.inputs import InputError
-from hector_jax.core.trajectory import State, has_fallen
 from hector_jax.export.export import find_weights
 from hector_jax.grfm.collection import load_walks
 from hector_jax.robot import kinematics
-from hector_jax.robot.description import Description, TuningSettings, read_description
+from hector_jax.robot.description import Description, TuningSettings
 from hector_jax.robot.kinematics import foot_jacobians, foot_poses
 from hector_jax.robot.model import compile_model, describe, load_robot
 from hector_jax.sim.loop import Job
@@ -108,36 +107,10 @@ def test_the_description_of_hector_says_what_the_code_takes_by_default():
         jax.tree.map(np.testing.assert_array_equal, of_robot, default)
 
 
-def test_a_description_adds_no_number_to_the_robot_and_what_is_compiled_knows_it(strider):
-    robot = load_robot()
-    assert len(jax.tree.leaves(robot)) == len(robot) - 2
-    name = jax.jit(lambda r: jnp.asarray(len(r.description.name)))
-    assert (int(name(robot)), int(name(strider))) == (6, 7)
-
-
-def test_strider_needs_forty_lines_at_most_and_is_no_hector(strider):
-    assert len(STRIDER.read_text().splitlines()) <= 40
-    hector = load_robot()
-    assert strider.mass > 1.5 * hector.mass
-    assert np.all(strider.joint_origin[:, 3:, 2] < 1.3 * hector.joint_origin[:, 3:, 2])
-    assert not np.allclose(strider.joint_origin[:, :3], hector.joint_origin[:, :3], atol=0.01)
-    config = walk_config(strider)
-    assert (config.gait.stance, config.mpc.max_force, config.footstep.width) == (22, 900.0, 0.1)
-    assert config.legs.kp == (150.0, 150.0, 150.0, 150.0, 50.0)
-    np.testing.assert_array_equal(expert(strider).R.force[1], [3.6e-5, 3.6e-5, 1.8e-4])
-
-
 def test_strider_stands_with_both_soles_on_the_floor(strider):
     feet = foot_poses_jit(strider, jnp.asarray(strider.standing_joints))
     np.testing.assert_allclose(feet.position[:, 2], -strider.trunk_height, atol=1e-5)
     assert -strider.heel < strider.com_offset[0] - feet.position[0, 0] < strider.toe
-
-
-def test_limits_of_a_fall_are_the_robots_own(strider):
-    zero = jnp.zeros(3)
-    low = State(zero, jnp.array([0.0, 0.0, 0.3]), zero, zero)
-    assert has_fallen(low, *strider.description.limits)
-    assert not has_fallen(low, *load_robot().description.limits)
 
 
 def test_imperfections_reach_the_joints_of_any_robot(strider):
@@ -232,14 +205,6 @@ def test_a_lead_before_the_gait_begins_is_refused_with_its_key():
     robot = robot._replace(description=replace(robot.description, tuning=settings))
     with pytest.raises(InputError, match=r"hector.toml: tuning: .*lead .*\(\d+ ticks\), got 1000"):
         tune_config(robot)
-
-
-def test_a_description_that_is_missing_or_too_big_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="none.toml: cannot read the robot description"):
-        read_description(tmp_path / "none.toml")
-    (tmp_path / "big.toml").write_text("#" * 200_000)
-    with pytest.raises(ValueError, match="big.toml: 0.2 MB, expected at most 0.1 MB"):
-        describe(tmp_path / "big.toml")
 
 
 def test_the_same_legs_can_be_expected_to_walk_as_fast_in_any_order_of_their_joints(

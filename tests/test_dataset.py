@@ -116,11 +116,6 @@ def test_named_commands_are_walked_unchanged():
             )
 
 
-def test_no_walks_are_refused():
-    with pytest.raises(ValueError, match="number of walks must be at least 1, got 0"):
-        draw_jobs(0, 0)
-
-
 # --- walks at the plan interval ---
 
 
@@ -235,12 +230,6 @@ def test_no_walk_is_in_both_parts_of_a_split(three, robot):
         assert len(train.walk) + len(held.walk) == len(data.walk)
 
 
-def test_a_split_needs_two_walks(robot):
-    data, _ = make_dataset(robot, walks_of(synthetic_walk(0, TICKS)))
-    with pytest.raises(ValueError, match="at least 2 walks, got 1"):
-        split_by_walk(data)
-
-
 # --- collection ---
 
 
@@ -303,11 +292,6 @@ def test_a_collection_of_something_else_is_not_overwritten(tmp_path, robot):
     assert (tmp_path / "walk-00000.npz").read_bytes() == before
     with pytest.raises(ValueError, match="walk-00000.npz: made for robot"):
         load_walks(tmp_path, heavier)
-
-
-def test_a_walk_that_did_not_come_is_told(tmp_path, robot):
-    with pytest.raises(ValueError, match="zip.* shorter"):
-        collect(tmp_path, draw_jobs(0, 4), lambda jobs: list(walker()(jobs))[:3], robot=robot)
 
 
 def test_a_collection_is_identified_by_its_walks_and_settings(tmp_path, robot):

@@ -26,10 +26,8 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
-from hector_jax.store import tunings
 from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import PAPER_LOSS
 from hector_jax.verdict import judging, metrics
 
@@ -176,14 +174,6 @@ def test_a_height_that_is_off_and_motors_at_their_limits_are_told(monkeypatch):
     assert torque.startswith(f"{text} (try a slower trajectory")
 
 
-def test_what_leads_to_a_fall_is_not_told_as_steady(monkeypatch):
-    walked = settled(0.0)
-    walked.state.position[150:, 2] -= 0.3
-    record = recorded(walked=walked)
-    record.torque[500:] = 1.0
-    assert lines(monkeypatch, record) == []
-
-
 def test_a_start_that_falls_is_refused_before_anything_is_collected(monkeypatch, tmp_path):
     made = []
 
@@ -209,29 +199,6 @@ def test_a_start_that_falls_is_refused_before_anything_is_collected(monkeypatch,
     assert len(made) == 2
 
 
-def test_a_start_that_falls_on_the_model_is_refused_before_anything_is_collected(monkeypatch):
-    zero = np.zeros(())
-    fell = Evaluation(zero, {}, nominal(), fallen=np.ones(()), residual=zero)
-    monkeypatch.setattr(tunings.difftune, "tune_step", lambda *args, **model: fell)
-    problem = tunings.Problem((named_command("straight"),), None)
-    with pytest.raises(InputError, match="the robot fell .try a slower or shorter trajectory"):
-        tunings._prepare_tuning(TuneConfig(), ROBOT, nominal(), problem)
-
-
-def test_a_tuned_set_that_walks_worse_than_nominal_is_told(capsys):
-    def scored(L):
-        score = metrics.score_like()
-        score = score._replace(losses=score.losses | {"L": np.array(L)})
-        last = pretend_walk().initial
-        return [judging.ScoredWalk(score, np.array(4.0), last, "", "")]
-
-    walks = {"nominal": scored(2e6), "without": scored(3e6), "with": scored(1e6)}
-    tuning._say_worse("straight", judging.ScoredWalks(walks, {}))
-    said = capsys.readouterr().err
-    assert "straight: on the high-fidelity simulator `without` walks with L 3e6, nominal" in said
-    assert "`with`" not in said
-
-
 # How a fall in the start-up is told
 
 
@@ -249,34 +216,6 @@ def test_hector_walk_tells_the_fall_and_prints_no_nan(monkeypatch, capsys):
     assert (told["seconds"], told["fell"]) == (-0.42, True)
     assert told["fall"] == FALL._asdict()
     assert told["rms_position"] == [None] * 3
-
-
-def test_an_evaluation_has_the_fall_before_t_0_and_tells_it_once_a_set(
-    monkeypatch, tmp_path, capsys
-):
-    made = []
-
-    def walks_of(setup, jobs, title, engine):
-        for job in jobs:
-            made.append(job.seed)
-            yield pretend_walk(1, seconds=1.0) if job.seed == 1 else fallen_at_once(job.seed)
-
-    monkeypatch.setattr(judging, "walk_jobs", walks_of)
-    monkeypatch.setattr(judging, "fall_of", lambda *args: FALL)
-    for _ in range(2):  # as walked, and from the folder
-        with ThreadPoolExecutor(1) as pool:
-            found = judging.judge(
-                Setup(pool, TuneConfig(), ROBOT),
-                {"mine": nominal()},
-                STRAIGHT,
-                [hfs()] * 3,
-                range(3),
-                title="",
-                folder=tmp_path,
-            )
-        assert [float(one.upright) for one in found.walks["mine"]] == [-0.42, 1.0, -0.42]
-        assert f"mine: 2 of 3 walks {TEXT}\n" in capsys.readouterr().err
-    assert made == [0, 1, 2]
 
 
 def test_the_table_of_a_set_that_always_falls_at_once_has_no_nan():

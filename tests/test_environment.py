@@ -65,31 +65,6 @@ def test_workers_need_no_renderer(monkeypatch):
     assert os.environ["MUJOCO_GL"] == "crayon"
 
 
-def test_modules_need_no_renderer_and_leave_the_variable():
-    program = """
-import importlib, os
-for module in ("robot.model", "sim.parallel", "report.view"):
-    importlib.import_module(f"hector_jax.{module}")
-    assert os.environ["MUJOCO_GL"] == "crayon", module
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        env=os.environ | {"MUJOCO_GL": "crayon"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-
-
-def test_a_cache_whose_name_is_not_utf8_is_told_in_one_line(tmp_path):
-    environment = USUAL | {"XDG_CACHE_HOME": os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9")}
-    done = hector("walk", env=environment)
-    assert done.returncode == 2
-    *loading, line = done.stderr.splitlines()
-    assert line.startswith("hector: XDG_CACHE_HOME or the folder of the cache must be in UTF-8")
-    assert loading in ([], ["loading JAX and MuJoCo"])  # if it takes long
-
-
 # Streams and signals
 
 TOY = """

@@ -6,9 +6,7 @@ import importlib.util
 import io
 import json
 import re
-import runpy
 import shutil
-import subprocess
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -453,12 +451,6 @@ def test_another_device_is_refused(monkeypatch):
         export_controller(CONFIG, ROBOT, expert())
 
 
-def test_without_flatbuffers_it_is_said_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "flatbuffers", None)
-    with pytest.raises(ValueError, match=r"hector-jax\[export\]"):
-        export_controller(CONFIG, ROBOT, expert())
-
-
 # The command
 
 
@@ -514,24 +506,6 @@ def test_what_differs_from_the_live_controller_is_not_written(
     assert list((run / "export").glob("[!.]*")) == []
 
 
-def test_the_example_says_what_it_expects(monkeypatch, capsys):
-    done = subprocess.run([sys.executable, EXAMPLE, "nowhere"], capture_output=True, text=True)
-    assert done.returncode == 1
-    (line,) = done.stderr.splitlines()
-    assert "nowhere: no controller.json; expected the folder that" in line
-    # the others without a process that loads JAX
-    monkeypatch.setattr(sys, "argv", [str(EXAMPLE)])
-    with pytest.raises(SystemExit) as ended:
-        runpy.run_path(str(EXAMPLE), run_name="__main__")
-    assert ended.value.code.startswith("expected the FOLDER that `hector export` wrote")
-    assert "\n" not in ended.value.code
-    monkeypatch.setattr(sys, "argv", [str(EXAMPLE), "--help"])
-    runpy.run_path(str(EXAMPLE), run_name="__main__")
-    out, err = capsys.readouterr()
-    assert "FOLDER is the one that `hector export` wrote" in out
-    assert err == ""
-
-
 def test_the_example_knows_nothing_of_us():
     tree = ast.parse(EXAMPLE.read_text())
     names = {
@@ -584,19 +558,3 @@ def test_bad_input_is_one_line_and_writes_nothing(monkeypatch, capsys, run, argu
     assert part in lines[0]
     assert "Traceback" not in out + err
     assert not (run / "export").exists()
-
-
-@pytest.mark.parametrize("text", ["", "{}", '{"tune": 3}', '{"tune": {"rollout": {"walk": 1}}}'])
-def test_a_run_without_settings_is_refused_by_name(run, text):
-    (run / "config.json").write_text(text)
-    with pytest.raises(ValueError, match=r"config\.json"):
-        find_weights(run, "best")
-
-
-def test_a_weights_file_is_exported_by_its_name(monkeypatch, tmp_path):
-    asked = []
-    monkeypatch.setattr(export, "export", lambda *known, **kw: asked.append(kw) or {})
-    path = tmp_path / "mine.json"
-    save_weights(path, expert())
-    assert call(monkeypatch, path, "--json") == 0
-    assert asked == [{"name": "mine", "seconds": 1.0}]

@@ -146,12 +146,6 @@ def test_feet_are_pairs_from_the_front_and_mirror_images():
     np.testing.assert_allclose(mirrored, ROBOT.inertia, atol=1e-9)
 
 
-def test_feet_of_bipeds_are_nowhere_ahead():
-    for name in ("strider", "humanoid"):
-        robot = load_robot(FILE.parents[1] / name / "robot.toml")
-        assert robot.foot_ahead.tolist() == [0.0, 0.0]
-
-
 def test_the_feet_stand_on_the_floor_under_their_hips():
     model, data = posed()
     for leg, foot in zip(LEGS, ROBOT.description.named_feet, strict=True):
@@ -319,12 +313,3 @@ def test_a_model_that_cannot_stand_or_lacks_a_motor_names_the_joint(tmp_path, ch
     description = replace(ROBOT.description, model=changed(tmp_path, change))
     with pytest.raises(InputError, match=words):
         robot_of(description)
-
-
-def test_a_wrong_file_ends_with_code_2(tmp_path, monkeypatch, capsys):
-    changed(tmp_path, ("a", "a"))
-    (tmp_path / "robot.toml").write_text(TABLE.replace("feet.hind_right", "feet.right"))
-    monkeypatch.setattr(sys, "argv", ["hector", "robot", str(tmp_path / "robot.toml")])
-    assert main() == 2
-    (line,) = [x for x in capsys.readouterr().err.splitlines() if x.startswith("hector: ")]
-    assert "feet: must have left, right; or front_left, " in line

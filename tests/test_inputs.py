@@ -26,7 +26,7 @@ from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError, did_you_mean, short_repr
 from hector_jax.core.settings import Range, convert
 from hector_jax.core.tree_file import save_tree
-from hector_jax.grfm import collection, network
+from hector_jax.grfm import collection
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.qp import QpConfig
 from hector_jax.report.video import VideoConfig
@@ -293,28 +293,6 @@ def spoilt(data, path):
     other = torn(data, content)
     assume(other != content)
     path.write_bytes(other)
-
-
-@pytest.fixture(scope="module")
-def net(folder):
-    """A small net of zeros."""
-    path = folder / "sound-net.npz"
-    like = network.empty_params("paper", (3,), WalkConfig())
-    network.save_net(path, like, robot=ROBOT, about={})
-    return path
-
-
-@hundreds
-@given(st.data())
-def test_nets_are_taken_or_refused_in_one_line(folder, net, data):
-    path = folder / "net.npz"
-    path.write_bytes(net.read_bytes())
-    spoilt(data, path)
-    found = refused_or(lambda path: network.load_net(path, ROBOT), path)
-    if found is not None:
-        params, variant, _ = found
-        assert variant == "paper"
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
 
 
 @pytest.fixture(scope="module")

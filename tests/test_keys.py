@@ -8,7 +8,6 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -164,12 +163,6 @@ class D:
 """
 
 
-@pytest.mark.parametrize("text", AROUND.values(), ids=AROUND)
-def test_a_function_of_the_user_is_seen_through_what_holds_it(tmp_path, text):
-    ids = [function_id(module(tmp_path, f"{IMPORTS}K = {k}\n{text}\n").f) for k in (2.0, 2.0, 3.0)]
-    assert ids[0] == ids[1] != ids[2]
-
-
 BEHIND = {**AROUND, **{name: f"f = {value}" for name, value in VALUES.items()}}
 
 
@@ -179,47 +172,6 @@ def test_what_a_module_of_the_user_holds_is_of_the_content(tmp_path, monkeypatch
         of_k = re.sub(r"\bK\b", str(k), text)
         monkeypatch.setitem(sys.modules, "other", module(tmp_path, IMPORTS + of_k))
         return function_id(module(tmp_path, "import other\ndef f(x): return other.f").f)
-
-    assert made(2.0) == made(2.0) != made(3.0)
-
-
-def test_what_no_function_names_is_no_content(tmp_path, monkeypatch):
-    def made(text):
-        monkeypatch.setitem(sys.modules, "other", module(tmp_path, f"k = 2.0\n{text}"))
-        return function_id(module(tmp_path, "import other\ndef f(x): return other.k * x").f)
-
-    assert made("unused = 1") == made("unused = 2")
-
-
-def test_docstrings_and_the_place_of_a_file_are_no_content(tmp_path):
-    def made(folder, doc):
-        folder.mkdir()
-        text = f"def f(x):\n    'In {doc}.'\n    return (lambda: 'a'), __file__, __name__"
-        return function_id(module(folder, text).f)
-
-    assert made(tmp_path / "a", "metres") == made(tmp_path / "b", "feet")
-
-
-def test_many_functions_and_an_empty_cell_are_read(tmp_path):
-    late = "def made():\n    def g(): return late\n    return g\n    late = 1\ng = made()"
-    chain = "\n".join(f"def f{i}(x): return f{i + 1}(x)" for i in range(3000))
-    text = f"{late}\n{chain}\ndef f3000(x): return "
-    ids = [function_id(module(tmp_path, f"{text}{k}, g").f0) for k in (1, 1, 2)]
-    assert ids[0] == ids[1] != ids[2]
-
-
-def test_a_module_that_a_module_of_the_user_imports_is_of_the_content(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(tmp_path)
-
-    def made(gain):
-        for name, text in (
-            ("third_of_user", f"K = {gain}\n"),
-            ("helper_of_user", "from third_of_user import K\ndef f(x): return K * x\n"),
-        ):
-            monkeypatch.setitem(sys.modules, name, module(tmp_path, text, name))
-        return function_id(
-            module(tmp_path, "import helper_of_user\ndef f(x): return helper_of_user.f(x)\n").f
-        )
 
     assert made(2.0) == made(2.0) != made(3.0)
 
@@ -244,24 +196,6 @@ def test_a_number_of_the_user_that_is_tuned_is_in_the_keys(monkeypatch, changed)
     before, again, after = keys(MINE), keys(MINE), keys(MINE._replace(**changed))
     assert before == again
     assert [x == y for x, y in zip(before, after, strict=True)] == [False, False, False, True]
-
-
-def test_a_record_of_a_number_of_the_user_goes_on_in_its_box_only(monkeypatch, tmp_path):
-    def begin(tunable):
-        monkeypatch.setitem(TUNABLES, "mine", tunable)
-        inputs = tmp_path, CONFIG, ROBOT, nominal(), {"s": named_command("s")}, [hfs()]
-        return walks.read_history(Campaign(*inputs, leg_numbers=("mine",)))
-
-    legs = Tunable("legs.height", 0.02, 0.2)
-    assert begin(legs) == begin(legs) == []
-    with pytest.raises(InputError, match="its settings is"):
-        begin(legs._replace(upper=0.1))
-
-
-def test_our_functions_and_installed_ones_have_their_names():
-    assert function_id(with_variation) == "hector_jax.tuning.rollout.with_variation"
-    assert function_id(jax.jit(with_variation)) == "hector_jax.tuning.rollout.with_variation"
-    assert function_id(np.linalg.norm).startswith("numpy.linalg.norm#")
 
 
 INSTALLED = (np.linalg.norm, optax.linear_schedule, lambda x: optax.linear_schedule(x, 0.0, 1))

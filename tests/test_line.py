@@ -190,24 +190,6 @@ def test_latest_is_the_newest_run(monkeypatch, tmp_path):
     assert resolve_latest(from_line(["view", "latest"])).run == Path("latest")
 
 
-def test_latest_without_a_run_is_refused(monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match="latest: there is no run in the folder `runs`"):
-        resolve_latest(from_line(["view", "latest"]))
-
-
-def test_help_shows_no_python(monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", "120")
-    for kind in COMMANDS.values():
-        monkeypatch.setattr(sys, "argv", ["hector", kind.__name__.lower(), "--help"])
-        with pytest.raises(SystemExit) as left:
-            main()
-        assert left.value.code == 0
-        shown = capsys.readouterr().out
-        assert "None" not in shown
-        assert "{None}" not in shown
-
-
 SLALOM = Path(__file__).parents[1] / "examples" / "slalom.toml"
 STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
 

@@ -2,7 +2,6 @@
 
 import json
 import sys
-from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -47,7 +46,6 @@ from hector_jax.grfm.paper import init as init_paper
 from hector_jax.grfm.paper import with_statistics as with_paper_statistics
 from hector_jax.grfm.residual import init, with_statistics
 from hector_jax.grfm.training import TrainConfig, train
-from hector_jax.qp import active_set
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
@@ -202,17 +200,6 @@ def test_a_foot_of_each_pair_lands_beside_its_own_hips():
     ahead, aside = float(np.ptp(ROBOT.foot_ahead)), 2 * CONFIG.footstep.width
     assert ahead > 0.3
     np.testing.assert_allclose(front - hind, [ahead, aside, 0.0], atol=0.01)
-
-
-def test_a_qp_larger_than_the_gpu_s_kernel_is_told(monkeypatch):
-    monkeypatch.setattr(active_set.jax, "default_backend", lambda: "gpu")
-    config, said = replace(CONFIG, mpc=replace(CONFIG.mpc, horizon=9)), []
-    monkeypatch.setattr(active_set, "say", said.append)
-    active_set._kernel.cache_clear()
-    for count in (4, 4):
-        jax.eval_shape(partial(solved.__wrapped__, config, count))  # told where it is traced
-    (line,) = said
-    assert "a QP of 108 variables and 180 rows takes the slower path" in line
 
 
 # Weights

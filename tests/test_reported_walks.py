@@ -4,10 +4,8 @@ The logs are drawn, not walked: what is tried here is what the folder makes of t
 """
 
 import json
-import sys
 from contextlib import nullcontext, suppress
 from dataclasses import replace
-from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -16,9 +14,8 @@ import numpy as np
 import pytest
 from test_walks import HandsOver
 
-from hector_jax.cli import evaluate, parse, propose
+from hector_jax.cli import evaluate, propose
 from hector_jax.cli.flags import Propose, Report, Walk
-from hector_jax.cli.main import main
 from hector_jax.control.trajectories import load_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import load_weights, save_weights
@@ -144,20 +141,6 @@ def refused(folder, words, *logs, **flags):
     assert content(folder) == before
 
 
-def test_a_campaign_goes_on_by_the_line(folder, robot, monkeypatch, capsys):
-    def typed(*words):
-        monkeypatch.setattr(sys, "argv", ["hector", *map(str, words)])
-        assert main() == 0, capsys.readouterr().err
-
-    typed("propose", folder, "--traj", "ahead.toml", "--tune", "foot_height", "--seed", 3)
-    for number in range(2):
-        if number:
-            typed("propose", folder)
-        typed("report", folder, carded(folder, robot, "ahead", number=number))
-    typed("report", folder, "--undo")
-    assert len(walks.read_history(campaign(folder))) == 1
-
-
 # Whose log it is
 
 
@@ -177,13 +160,6 @@ def test_swapped_logs_without_cards_are_refused(folder, robot):
     refused(folder, words, *logs)
 
 
-def test_a_named_log_counts_although_another_trajectory_fits_better(folder, robot, capsys):
-    next_walk(folder)
-    logs = [f"{own}={plain(robot, other)}" for own, other in (("aside", "back"), ("back", "aside"))]
-    report(folder, plain(robot, "ahead"), *logs)
-    assert result(capsys)["logs"]["aside"]["rms_position"][0] > 0.02
-
-
 def test_logs_by_name_come_in_any_order(folder, robot, capsys):
     next_walk(folder)
     by_name = [f"{name}={carded(folder, robot, name)}" for name in ("back", "ahead", "aside")]
@@ -192,12 +168,6 @@ def test_logs_by_name_come_in_any_order(folder, robot, capsys):
     for case, name in enumerate(("ahead", "aside", "back")):
         kept = walks.log_paths(campaign(folder), 0)[case]
         assert kept.read_bytes() == Path(f"{name}.npz").read_bytes()
-
-
-def test_plain_logs_are_of_the_trajectories_that_are_not_named(folder, robot):
-    next_walk(folder)
-    logs = {name: carded(folder, robot, name) for name in SPEEDS}
-    report(folder, logs["ahead"], f"aside={logs['aside']}", logs["back"])
 
 
 @pytest.mark.parametrize(
@@ -214,28 +184,12 @@ def test_names_that_do_not_fit_are_refused(folder, logs, words):
     refused(folder, words, *logs)
 
 
-def test_a_log_of_other_weights_is_refused(folder, robot):
-    next_walk(folder, ("ahead",))
-    log = carded(folder, robot, "ahead", weights=expert(robot))
-    words = r"^ahead.npz: a walk with other weights than the proposed ones, robot/weights/0.json$"
-    refused(folder, words, log)
-    own = load_weights(walks.weights_path(folder, 0), robot)
-    higher = own._replace(others={"foot_height": own.others["foot_height"] + 0.01})
-    refused(folder, words, carded(folder, robot, "ahead", weights=higher))
-
-
 def test_a_log_of_the_set_before_is_refused(folder, robot):
     next_walk(folder, ("ahead",))
     log = carded(folder, robot, "ahead")
     report(folder, log)
     next_walk(folder, ("ahead",))
     refused(folder, "other weights than the proposed ones, robot/weights/1.json", log)
-
-
-def test_a_log_of_another_command_of_the_same_name_is_refused(folder, robot):
-    next_walk(folder, ("ahead",))
-    log = carded(folder, robot, "ahead", card={"command": "0123456789abcdef"})
-    refused(folder, "a walk of ahead with another command, expected ahead;", log)
 
 
 @pytest.mark.parametrize(
@@ -268,13 +222,6 @@ def test_a_card_that_was_edited_is_refused(folder, robot):
     with np.load(log) as archive:
         np.savez("edited.npz", **archive)
     refused(folder, "^edited.npz: cut or changed since it was written", "edited.npz")
-
-
-def test_a_card_of_no_walk_is_that_of_a_log_without_one(folder, robot, capsys):
-    next_walk(folder, ("ahead",))
-    save_tree(Path("log.npz"), drawn(robot, "ahead"), kind="trajectory", robot=robot)
-    report(folder, "log.npz")
-    assert result(capsys)["walk"] == 0
 
 
 # What is shown
@@ -330,66 +277,6 @@ def test_a_report_that_is_undone_and_made_again_leaves_the_same_bytes(folder, ro
     assert again.items() >= after.items()
     kept = {str(Path(log).relative_to(folder)), "weights/2.json"}
     assert again.keys() - after.keys() == kept  # and no proposal from the history before
-
-
-def test_another_log_after_an_undo_counts_in_place_of_the_first(folder, robot, capsys):
-    next_walk(folder, ("ahead",))
-    report(folder, plain(robot, "ahead", "wrong.npz", error=0.01))
-    capsys.readouterr()
-    propose.report(Report(folder, (), undo=True))
-    shown = capsys.readouterr().out
-    assert shown.startswith("walk 0 is to be walked again, with robot/weights/0.json; its logs: ")
-    report(folder, plain(robot, "ahead", "right.npz"))
-    logs = sorted((folder / "logs").iterdir())
-    assert [log.read_bytes() for log in logs] == [
-        Path("wrong.npz").read_bytes(),
-        Path("right.npz").read_bytes(),
-    ]
-    assert len(rows(folder)) == 1
-
-
-def test_the_logs_of_an_interrupted_report_are_reported_from_the_folder(folder, robot, capsys):
-    next_walk(folder, ("ahead",))
-    log = plain(robot, "ahead")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(walks, "add_row", lambda *_: sys.exit())  # killed
-        with pytest.raises(SystemExit):
-            report(folder, log)
-    report(folder, str(folder / "logs" / "0-0.npz"))
-    assert len(rows(folder)) == 1
-    assert (folder / "logs" / "0-0.npz").read_bytes() == Path("ahead.npz").read_bytes()
-
-
-def test_each_undo_takes_back_one_report_until_there_is_none(folder, robot, capsys):
-    contents = []
-    for number in range(3):
-        next_walk(folder, ("ahead",))
-        contents.append(content(folder))
-        report(folder, carded(folder, robot, "ahead", f"{number}.npz", number=number))
-    for number in (2, 1, 0):
-        capsys.readouterr()
-        report(folder, undo=True)
-        assert result(capsys)["walk"] == number
-        assert content(folder).items() >= contents[number].items()
-    refused(folder, "^robot: no report to undo$", undo=True)
-    for number in range(3):  # the logs of the undone are there to be reported again
-        assert content(folder).items() >= contents[number].items()
-        (log,) = (folder / "logs").glob(f"{number}-0-undone-*.npz")
-        report(folder, str(log))
-        next_walk(folder)
-
-
-def test_the_line_has_logs_or_undo(folder):
-    Path("a=b.npz").write_text("")
-    for line in ("robot --undo", "robot ahead=a=b.npz --no-undo", "robot ahead=a=b.npz"):
-        parse.check(parse.from_line(["report", *line.split()]))
-    for line, words in (
-        ("robot", "^LOGS expects a value, got none; or --undo$"),
-        ("robot ahead=nowhere.npz --undo", "^--undo takes no LOGS, got 'ahead=nowhere.npz'$"),
-        ("robot ahead=nowhere.npz", "nowhere.npz: cannot read the file: No such file"),
-    ):
-        with pytest.raises(InputError, match=words):
-            parse.check(parse.from_line(["report", *line.split()]))
 
 
 STEPS = [(walks, "add_row"), (reported_walks, "write_file"), (Path, "replace"), (Path, "unlink")]
@@ -487,14 +374,6 @@ def test_reports_are_scored_by_the_present_loss(walked, monkeypatch):
     next_walk(walked)  # and it goes on
 
 
-def test_reports_are_scored_by_the_present_code_of_the_loss(walked, monkeypatch):
-    before, files, loss_of = rows(walked), content(walked), walk_log.loss_of
-    monkeypatch.setattr(walk_log, "loss_of", lambda *inputs: 2.0 * loss_of(*inputs))
-    for old, new in zip(before, rows(walked), strict=True):
-        np.testing.assert_array_equal(new.losses, 2.0 * old.losses)
-    assert content(walked) == files
-
-
 def test_reports_are_those_of_a_robot_whose_file_weighs_its_loss_otherwise(walked, robot):
     one = campaign(walked)
     heavier = replace(robot.description, loss=(("L_pos", 1e9),), nominal=None, max_tilt=0.7)
@@ -512,19 +391,6 @@ def test_reports_outlive_the_code_and_packages_that_took_them(walked, monkeypatc
     for old, new in zip(before, rows(walked), strict=True):
         jax.tree.map(np.testing.assert_array_equal, old, new)
     assert content(walked) == files
-
-
-def test_points_follow_from_the_weights_where_the_code_places_them_otherwise(walked, monkeypatch):
-    units = campaigns._units
-    thrice = lambda one: units(one) * np.where(np.arange(len(units(one))) < 18, 1.0, 3.0)  # noqa: E731
-    monkeypatch.setattr(campaigns, "_units", thrice)
-    one = campaign(walked)
-    space = walks.campaign_space(HandsOver(), one)
-    for number, row in enumerate(rows(walked)):
-        kept = load_weights(walks.weights_path(walked, number), one.robot)
-        again = campaigns.weights_at(one, space, row.point)
-        jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-12), again, kept)
-    assert row.point[-1] == pytest.approx(POINTS[1, -1] / 3.0)
 
 
 def test_a_folder_goes_on_where_its_start_is_another_file_now(folder, robot):

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import BrokenExecutor, Executor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,17 +18,15 @@ from killed import toy
 from hector_jax.cli import flags, run_folder
 from hector_jax.cli import tune as command
 from hector_jax.cli.parse import from_line
-from hector_jax.control.trajectories import command_of
 from hector_jax.control.weights import nominal
 from hector_jax.core import files as core_files
 from hector_jax.core.console import exit_code
-from hector_jax.core.files import WriteError, locked, write_file, write_json
+from hector_jax.core.files import WriteError, locked
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
 from hector_jax.core.tree_file import load_tree, save_tree
 from hector_jax.robot.model import load_robot
 from hector_jax.store.cache import load_or_make
-from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig, descend
 
 ROBOT, CONFIG, HERE = load_robot(), TuneConfig(iterations=14), Path(__file__).parent
@@ -179,18 +176,6 @@ def cut():
     raise Cut
 
 
-def test_what_stands_is_never_half_of_a_file(tmp_path):
-    path = tmp_path / "file"
-    write_file(path, b"old")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "replace", lambda *paths: cut())
-        with pytest.raises(Cut):
-            write_file(path, b"new")
-    assert files(tmp_path) == {"file": b"old"}
-    write_file(path, b"new")
-    assert files(tmp_path) == {"file": b"new"}
-
-
 # Signals: a program with a worker that would sleep for an hour.
 
 PROGRAM = """
@@ -272,51 +257,6 @@ def test_a_worker_that_is_killed_is_told_in_one_line(capsys):
     assert capsys.readouterr().err == line
 
 
-class Odd(Exception):  # noqa: N818
-    """An exception that cannot be unpickled."""
-
-    def __init__(self, one, other):
-        super().__init__(one + other)
-
-
-def _fail_oddly():
-    raise Odd("a", "b")
-
-
-def test_an_exception_that_cannot_be_unpickled_keeps_its_traceback():
-    def work():
-        with workers(1) as pool:
-            pool.submit(_fail_oddly).result()
-
-    with pytest.raises(BrokenExecutor) as caught:
-        exit_code("toy", work)
-    assert "__init__() missing 1 required" in str(caught.value.__cause__)
-
-
-def test_without_any_place_for_a_cache_a_command_ends_in_one_line(tmp_path):
-    wall = tmp_path / "wall"
-    wall.write_text("")
-    told = (
-        "import sys\n"
-        "sys.argv = ['hector', 'walk']\n"
-        "from hector_jax.cli.main import main\n"
-        "sys.exit(main())"
-    )
-    ran = subprocess.run(
-        [sys.executable, "-c", told],
-        env={**os.environ, "HOME": str(wall), "XDG_CACHE_HOME": "", "PYTHONPATH": str(HERE.parent)},
-        capture_output=True,
-        text=True,
-    )
-    assert ran.returncode == 2
-    text = (
-        f"no folder for compiled programs: {wall}/.cache/hector_jax/jax: Not a directory; set XDG"
-    )
-    *loading, line = ran.stderr.splitlines()
-    assert line.startswith(f"hector: {text}_CACHE_HOME")
-    assert loading in ([], ["loading JAX and MuJoCo"])  # if it takes long
-
-
 # hector tune --resume
 
 
@@ -327,12 +267,6 @@ def begun(tmp_path, monkeypatch):
     told = []
     command.tune(flags.Tune(traj=("c",), seeds=3, out=tmp_path / "run"))
     return tmp_path / "run", told
-
-
-def test_a_run_is_taken_up_with_the_flags_it_was_begun_with(begun):
-    folder, told = begun
-    command.tune(flags.Tune(resume=folder, processes=1))
-    assert (told[-1].traj, told[-1].seeds, told[-1].processes) == (("c",), 3, 1)
 
 
 def test_what_changes_no_number_stays_as_it_was_unless_another_is_given(tmp_path, monkeypatch):
@@ -425,41 +359,6 @@ def test_a_run_of_another_trajectory_is_not_taken_up(tmp_path):
         run_folder.check_agreement(
             tmp_path, begun, {"command": {"velocity": [[0.5, 0.0]]}, "seconds": 2.0}
         )
-
-
-def test_a_run_folder_that_cannot_be_made_is_not_said_to_exist(tmp_path, monkeypatch):
-    def full(path, target):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(Path, "rename", full)
-    for named in ({"out": tmp_path / "run"}, {"runs": tmp_path}):
-        with pytest.raises(
-            InputError, match=f"^cannot write {tmp_path}.*: No space left on device$"
-        ):
-            command.tune(flags.Tune(traj=("c",), **named))
-
-
-def test_a_run_is_not_resumed_from_another_start(tmp_path):
-    def run(**others):
-        return command._Run(
-            setup=Setup(Executor(), TuneConfig(), load_robot()),
-            folder=tmp_path,
-            args=flags.Tune(traj=("straight",)),
-            start=nominal()._replace(others={name: np.array(x) for name, x in others.items()}),
-            trajectories=(command_of("straight"),),
-            net=SimpleNamespace(params=None),
-        )
-
-    for begun, here in ((run(), run(turn_lead=0.8)), (run(turn_lead=0.8), run())):
-        write_json(tmp_path / "config.json", {})
-        noted = command._note_settings(begun)
-        assert command._note_settings(begun) == noted
-        with pytest.raises(InputError, match="start of other numbers beside Q and R"):
-            command._note_settings(here)
-    write_json(tmp_path / "config.json", {})
-    command._note_settings(run(turn_lead=0.8))
-    with pytest.raises(InputError, match=r"begun with start.others.turn_lead 0.8, here is 0.9"):
-        command._note_settings(run(turn_lead=0.9))
 
 
 # A flag that was given is a flag that was given, also at its default

@@ -2,8 +2,6 @@
 
 import contextlib
 import io
-import subprocess
-import sys
 from functools import partial
 
 import mujoco
@@ -58,20 +56,6 @@ def body_pairs(model, data):
 def test_robot_weighs_twelve_kilograms_and_has_sixteen_degrees_of_freedom(model, robot):
     assert robot.mass == pytest.approx(12.0, abs=0.05)
     assert (model.nv, model.nu) == (16, 10)
-
-
-def test_knees_have_67_newton_metres_and_the_others_half(robot):
-    np.testing.assert_array_equal(robot.torque_limit, [33.5, 33.5, 33.5, 67.0, 33.5] * 2)
-
-
-def test_joint_limits_are_those_of_the_facts_sheet(robot):
-    np.testing.assert_array_equal(robot.joint_lower, [-0.70, -0.60, -0.6, -2.38, -1.4] * 2)
-    np.testing.assert_array_equal(robot.joint_upper, [0.70, 0.60, 1.9, -0.10, 1.4] * 2)
-
-
-def test_actuators_and_joints_come_left_leg_then_right(model):
-    assert [model.actuator(i).name for i in range(model.nu)] == list(Description.joints)
-    assert list(model.actuator_trnid[:, 0]) == list(range(1, 11))
 
 
 def test_standing_trunk_is_at_548_millimetres_with_both_soles_on_the_floor(model, robot):
@@ -282,27 +266,3 @@ def test_wrong_description_is_refused_in_one_line(tmp_path, change, words):
     message = refusal(tmp_path, change(TEXT))
     for word in words:
         assert word in message
-
-
-def test_missing_file_and_folder_are_refused_in_one_line(tmp_path):
-    for path in (tmp_path / "nothing.xml", tmp_path):
-        with pytest.raises(ValueError, match="cannot read the robot description") as caught:
-            load_robot(path)
-        assert str(path) in str(caught.value)
-
-
-def test_binary_file_is_refused(tmp_path):
-    path = tmp_path / "robot.xml"
-    path.write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(ValueError, match="not a text file"):
-        load_robot(path)
-
-
-def test_loading_the_robot_prints_nothing():
-    done = subprocess.run(
-        [sys.executable, "-c", "from hector_jax.robot.model import load_robot; load_robot()"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert (done.stdout, done.stderr) == ("", "")

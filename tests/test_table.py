@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 import table_report as table
 from pretend import pretend_score, pretend_tuning, pretend_verdict
-from table_report import PAPER, Fall, Search, Table, summaries, write_table
+from table_report import PAPER, Fall, Search, Table, write_table
 
 from hector_jax.report.report import Picture
 from hector_jax.tuning.loss import PAPER_LOSS
 from hector_jax.verdict import metrics
-from hector_jax.verdict.metrics import BASELINES
 
 
 def judged(seeds=4, fell=(), **levels):
@@ -24,10 +23,6 @@ def judged(seeds=4, fell=(), **levels):
         for name, level in levels.items()
     }
     return metrics.make_verdict(PAPER_LOSS, range(seeds), {"s": scores})
-
-
-def with_losses(score, **losses):
-    return score._replace(losses=score.losses | losses)
 
 
 GOOD = {"nominal": 5e6, "expert": 4e6, "search_200": 2e6, "without": 3e6, "with": 1.5e6}
@@ -67,34 +62,6 @@ def test_the_ranking_is_by_the_median_of_the_paired_ratio():
     assert table.ranking(judged(**GOOD)) == ["with", "search_200", "without", "expert", "nominal"]
 
 
-def test_the_order_is_held_against_that_of_an_earlier_table(tmp_path):
-    write_table(tmp_path, whole(s=judged(**GOOD, mine=1e6)))
-    earlier = table.load_earlier(tmp_path / "table.json", range(4, 8))
-    assert earlier.plants == "seeds 0-3"
-    assert table.load_earlier(tmp_path / "table.json", range(4), "even") == earlier
-    with pytest.raises(ValueError, match=r"table.json: a table of the same plants, seeds 0-3"):
-        table.load_earlier(tmp_path / "table.json", range(4))
-    assert table.swapped_sets({"s": judged(**GOOD)}, earlier) == {"s": []}
-    other = judged(**GOOD | {"with": 2.5e6})
-    assert table.swapped_sets({"s": other}, earlier) == {"s": [("with", "search_200")]}
-    assert table.swapped_sets({"c": judged(**GOOD)}, earlier) == {"c": None}
-    for verdict, words in ((judged(**GOOD), "the same"), (other, "`with` and `search_200`")):
-        text = write_table(tmp_path, whole(s=verdict)._replace(earlier=earlier)).read_text()
-        assert "The order of the sets, against that on seeds 0-3" in text
-        assert re.search(rf"^- s: .*{words}$", text, re.MULTILINE)
-        (swapped,) = json.loads((tmp_path / "table.json").read_text())["swapped"].values()
-        assert swapped == ([] if words == "the same" else [["with", "search_200"]])
-
-
-@pytest.mark.parametrize("content", [None, "", "[]", "{}", '{"trajectories": {"s": 1}}'])
-def test_a_file_that_is_no_table_is_refused(tmp_path, content):
-    path = tmp_path / "table.json"
-    if content is not None:
-        path.write_text(content)
-    with pytest.raises(ValueError, match="table.json"):
-        table.load_earlier(path, range(4))
-
-
 def test_the_four_files_tell_the_same_numbers(tmp_path):
     verdict = pretend_verdict(8)
     path = write_table(tmp_path, whole(straight=verdict, c=verdict))
@@ -121,25 +88,6 @@ def test_the_four_files_tell_the_same_numbers(tmp_path):
     assert shown in (tmp_path / "table.tex").read_text().replace("$", "")
 
 
-def test_the_report_tells_everything_that_was_promised(tmp_path):
-    text = write_table(tmp_path, whole(s=judged(**GOOD))).read_text()
-    for words in (
-        "hardware stand-in",
-        "s: `with` against `search_200`",
-        "| s: with | 1.47e3 | 286 | 1.02e6 | 2.05e8 |",
-        "![Snapshots.](pictures/s.png)",
-        "None of the 20 walks ended in a fall.",
-        "| s: `search_200` | 200 | 187 | 1.200 | 20 generations |",
-        "ended because: 12 iterations",
-        "were made at `abc`",
-        "python experiments/table.py",
-    ):
-        assert words in text, words
-    for block in text.split("\n\n"):
-        counts = {row.count("|") for row in block.splitlines() if row.startswith("|")}
-        assert len(counts) <= 1, block
-
-
 def test_every_fall_is_shown_and_the_comparison_marked(tmp_path):
     fell = {("with", 1), ("with", 3)}
     told = whole(s=judged(fell=fell, **GOOD))._replace(
@@ -152,17 +100,6 @@ def test_every_fall_is_shown_and_the_comparison_marked(tmp_path):
     assert re.search(r"s: `with` against `without` .*\d\] \\\*", text)
     assert "$^{*}$" in (tmp_path / "table.tex").read_text()
     assert json.loads((tmp_path / "table.json").read_text())["falls"][1]["seed"] == 3
-
-
-def test_a_set_that_falls_at_once_leaves_files_that_can_be_read(tmp_path):
-    verdict = judged(fell={("with", i) for i in range(4)}, **GOOD)
-    lost = with_losses(verdict.scores["with"], L_ctrl=np.zeros((4, 1)))._replace(
-        rms_euler=np.full((4, 1, 3), np.nan),
-        rms_position=np.full((4, 1, 3), np.nan),
-    )
-    scores = verdict.scores | {"with": lost}
-    write_table(tmp_path, whole(s=verdict._replace(scores=scores)))
-    json.loads((tmp_path / "table.json").read_text(), parse_constant=lambda x: pytest.fail(x))
 
 
 def test_the_latex_table_is_well_formed(tmp_path):
@@ -187,15 +124,3 @@ def test_the_latex_table_is_well_formed(tmp_path):
         assert not re.search(r"(?<!\\)[_%#^]", outside), line
     assert r"my\_own" in text
     assert text.count(r"\textbf") == 8
-
-
-def test_words_are_escaped_for_latex():
-    assert table.tex(r"a_b & 5% #1 {x} ~^$ \n") == (
-        r"a\_b \& 5\% \#1 \{x\} \textasciitilde{}\textasciicircum{}\$ \textbackslash{}n"
-    )
-
-
-def test_baselines_are_not_told_against_themselves():
-    found = summaries({"s": judged(**GOOD)})
-    assert list(found["s", "nominal"].against) == ["expert"]
-    assert list(found["s", "with"].against) == [*BASELINES, "without", "search_200"]

@@ -87,12 +87,6 @@ def test_the_residual_net_beats_its_linear_part_on_walks_it_never_saw(parts, res
     assert told["net"]["force"] < 1.001 * history.valid_force.min()
 
 
-def test_members_of_an_ensemble_differ(residual):
-    kernels = residual[0].force["Dense_0"]["kernel"]
-    assert len(kernels) == 4
-    assert np.ptp(kernels, axis=0).min() > 0.0
-
-
 def test_the_errors_by_phase_and_axis_make_up_the_whole(parts):
     told = errors(last_command, parts[1])
     share = parts[1].window.contact.mean()
@@ -147,15 +141,6 @@ def test_l2_keeps_the_kernels_small(parts, residual):
     strong, _ = train(TrainConfig(epochs=10, batch=64, learning_rate=2e-3, l2=0.1), *parts)
     size = [np.abs(one.force["Dense_1"]["kernel"]).mean() for one in (residual[0], strong)]
     assert size[1] < 0.5 * size[0]
-
-
-def test_progress_is_told_after_each_epoch(trained, told):
-    assert told == [(epoch, epoch) for epoch in range(1, 26)]
-
-
-def test_a_batch_larger_than_the_data_is_all_of_it(parts):
-    _, history = train(TrainConfig("paper", epochs=1, batch=10_000, mirror=False), *parts)
-    assert np.isfinite(history).all()
 
 
 def test_no_samples_or_no_sense_are_refused(parts):

@@ -57,13 +57,6 @@ def test_what_a_segment_leaves_out_is_zero_and_whole_numbers_will_do(tmp_path):
     assert found.seconds == 2.0
 
 
-def test_a_built_in_trajectory_is_taken_by_its_name():
-    found = command_of("s")
-    assert (found.name, found.seconds) == ("s", None)
-    for got, expected in zip(found.command, named_command("s"), strict=True):
-        np.testing.assert_array_equal(got, expected)
-
-
 HEAD = 'name = "mine"\n[[segment]]\nseconds = 1.0\n'
 
 
@@ -187,17 +180,6 @@ def test_rollouts_are_as_long_as_the_file_says():
     config = TuneConfig()
     assert arguments.with_length(config, command_of(str(SLALOM))).rollout.ticks == 600
     assert arguments.with_length(config, command_of("c")) == config
-
-
-@pytest.mark.parametrize("command", ["walk", "evaluate", "tune", "search"])
-def test_a_wrong_file_is_one_line_of_each_command(monkeypatch, capsys, tmp_path, command):
-    monkeypatch.chdir(tmp_path)
-    path = written(tmp_path, HEAD + "vx = 1")
-    assert call(monkeypatch, command, "--traj", path) == 2
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
-    assert "mine.toml: segment 1: unknown field 'vx'" in err
-    assert [p.name for p in tmp_path.iterdir()] == ["mine.toml"]
 
 
 @pytest.mark.slow

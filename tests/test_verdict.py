@@ -17,7 +17,6 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.report import matrix as report
-from hector_jax.report import plots
 from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.engine import MUJOCO_C
@@ -196,23 +195,6 @@ def test_the_report_has_a_page_its_numbers_and_a_picture(tmp_path, drawn):
     assert [text.get_text() for text in panels[1].texts] == ["2 fell"]
 
 
-def test_an_interval_beyond_the_edge_of_the_picture_ends_at_the_edge(tmp_path, drawn):
-    cells = {(C, "s"): cell(tuned=40e6)}  # ten times nominal
-    plots.matrix(tmp_path / "verdict.png", cells, report.title_of)
-    ends = np.concatenate([line.get_xdata() for line in drawn[0].axes[0].lines])
-    assert ends.max() == 60.0
-
-
-def test_one_set_beside_nominal_is_enough_and_is_printed(capsys):
-    two = cell(4, [("expert", 0)])
-    two = two._replace(scores={name: two.scores[name] for name in ("nominal", "expert")})
-    report.print_verdict({(C, "s"): two}, {}, "standin")
-    out = capsys.readouterr().out
-    assert "s in MuJoCo C" in out
-    assert "expert -25 [-25, -25] * (1 fall)\n" in out
-    assert "`expert` is below nominal in 0 of 1 cell" in out
-
-
 # The command
 
 
@@ -357,16 +339,6 @@ def test_a_tuning_walks_its_sets_in_the_engines_where_it_has_not_walked(tmp_path
     small(tmp_path)
     assert [name for name, _ in walked.jobs] == ["drake"] * 4
     assert "s in Drake" in capsys.readouterr().out
-
-
-def test_a_tuning_without_other_engines_walks_on_other_masses(monkeypatch, tmp_path, walked):
-    monkeypatch.setattr(
-        command, "choose_engine", lambda name: MUJOCO_C if name == "c" else missing()
-    )
-    small(tmp_path)
-    assert [name for name, _ in walked.jobs] == ["c"] * 8
-    masses = sorted({float(job.imperfections.mass) for _, job in walked.jobs})
-    np.testing.assert_allclose(masses, np.array([0.9, 1.1]) * standin(0).mass)
 
 
 # The families

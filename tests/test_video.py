@@ -1,7 +1,6 @@
 """Films: poses are those that were walked, and no machine's missing back end ends a run."""
 
 import pickle
-import subprocess
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -9,10 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 from PIL import Image
-from pretend import elsewhere, pretend_walk
+from pretend import pretend_walk
 from scipy.spatial.transform import Rotation
 
-from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State
 from hector_jax.report import render, video
 from hector_jax.report.motion import motion, motions, poses
@@ -36,12 +34,6 @@ def test_a_drawn_pose_has_the_walked_centre_of_mass_and_attitude(robot):
     np.testing.assert_allclose(data.subtree_com[1], position[0], atol=1e-9)
     expected = Rotation.from_euler("ZYX", euler[0, ::-1]).as_matrix()
     np.testing.assert_allclose(data.xmat[1].reshape(3, 3), expected, atol=1e-9)
-
-
-def scene_of(robot, walks, times=(0.0,)):
-    path = Path("film.mp4")
-    scene = video.make_scene(path, robot, motions(robot, walks), VideoConfig(), strip=False)
-    return scene._replace(times=np.asarray(times))
 
 
 def test_a_film_shows_the_state_of_its_time_whatever_the_walks_rate(robot):
@@ -68,42 +60,6 @@ def test_a_robot_that_fell_stays_where_it_was_last_seen(robot):
     for values in (fell.qpos, fell.path):
         assert np.isfinite(values).all()
         np.testing.assert_array_equal(values[50], values[-1])
-
-
-def test_before_and_after_have_one_reference_wherever_the_robots_began(robot):
-    walk = pretend_walk(seconds=1.0, turn=1.0)
-    one, other = motions(robot, {"a": walk, "b": elsewhere(walk, (0.3, -0.2), 0.4)}).values()
-    np.testing.assert_allclose(other.path, one.path, atol=1e-9)
-    np.testing.assert_allclose(other.reference, walk.reference.position, atol=1e-9)
-
-
-@pytest.mark.parametrize("seconds", [0.1, 0.3, 1.7, 4.0])
-@pytest.mark.parametrize("tiles", [2, 6])
-def test_snapshots_show_as_many_phases_of_the_gait_as_there_are(robot, seconds, tiles):
-    times = video._snapshot_times(motion(robot, pretend_walk(seconds=seconds)), seconds, tiles)
-    assert (np.diff(times) > 0).all()
-    assert times[0] == 0.0
-    assert times[-1] <= seconds
-    cycle = min(0.4, seconds)
-    np.testing.assert_allclose(np.mod(times, cycle) / cycle, np.arange(tiles) / tiles, atol=0.01)
-
-
-def test_the_camera_of_four_seconds_stands_still_and_sees_the_whole_reference(robot):
-    walk = pretend_walk(seconds=4.0, turn=np.pi / 4)
-    scene = scene_of(robot, {"a": walk, "b": walk}, 0.1 * np.arange(41))
-    first, *rest = render._cameras(scene, 40.0, 1.0, 4.0)
-    assert all((camera.lookat == first.lookat).all() for camera in rest)
-    turn = [90.0 - first.azimuth, -first.elevation]  # looks along y, then down
-    R = Rotation.from_euler("zx", turn, degrees=True).as_matrix()
-    for height in (0.0, scene.top):
-        points = walk.reference.position * [1.0, 1.0, 0.0] + [0.0, 0.0, height]
-        across, ahead, up = ((points - first.lookat) @ R.T).T
-        seen = np.tan(np.deg2rad(20.0)) * (ahead + first.distance)
-        assert (np.abs(across) < seen).all()
-        assert (np.abs(up) < seen).all()
-    close, *_, last = render._cameras(scene, 40.0, 1.0, 0.8)
-    assert close.distance < first.distance
-    assert np.linalg.norm(last.lookat - close.lookat) > 0.5
 
 
 @pytest.mark.filterwarnings("ignore:os.fork")  # of the reader used here, not of the writer
@@ -144,31 +100,6 @@ def test_no_back_end_costs_one_line(robot, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("count", [1, 5])
-def test_the_plot_of_a_frame_is_pale_where_time_has_not_come_yet(robot, count):
-    walks = {"a": pretend_walk(seconds=1.0), "b": pretend_walk(seconds=1.0)}
-    scene = scene_of(robot, walks, np.linspace(0.0, 1.0, 5)[:count])
-    box = (20, 10, 120, 40)
-    black = np.zeros((60, 140, 3), np.uint8)
-    half = np.zeros((100, 70, 3), np.uint8)
-    for k in range(count):
-        below = np.asarray(render._frame(scene, black, box, [half, half], k))[100:, :, 0]
-        assert below.shape == (60, 140)
-        past = below[10:40, 20:121].max(axis=0) == 0
-        assert past.tolist() == [True] * (25 * k) + [False] * (101 - 25 * k)
-        assert not np.delete(below, np.s_[10:40], axis=0).any()
-
-
-def test_a_back_end_that_fails_is_told_by_its_first_fault(tmp_path, monkeypatch):
-    text = (
-        "warning\nTraceback (most recent call last):\n  File a\nKeyError: 'sky'\n"
-        "Exception ignored in: x\nTraceback (most recent call last):\n  File b\nEGLError: (\n)\n"
-    )
-    done = subprocess.CompletedProcess([], 1, "", text)
-    monkeypatch.setattr(video.subprocess, "run", lambda *args, **rest: done)
-    assert video._draw_in_child(tmp_path, "egl") == "KeyError: 'sky'"
-
-
 @pytest.mark.parametrize("name", ["film.mp4", "film.webp"])
 def test_back_ends_are_tried_in_turn_until_one_draws(robot, tmp_path, monkeypatch, name):
     tried = []
@@ -189,25 +120,3 @@ def test_back_ends_are_tried_in_turn_until_one_draws(robot, tmp_path, monkeypatc
     assert write_film(tmp_path / name, robot, walks) == "osmesa"
     assert tried == ["egl", "osmesa"]
     assert (tmp_path / name).read_bytes() == b"film"
-
-
-def test_a_film_shows_two_walks(robot, tmp_path):
-    with pytest.raises(ValueError, match="two walks side by side, got 1"):
-        write_film(tmp_path / "film.mp4", robot, {"a": motion(robot, pretend_walk(seconds=0.1))})
-
-
-def test_the_child_process_finds_the_module_that_draws(robot, tmp_path, monkeypatch):
-    """Whatever back ends there are: it gets as far as the scene that is missing."""
-    monkeypatch.setenv("PYTHONPATH", "")
-    assert "scene.pickle" in video._draw_in_child(tmp_path, "disable")
-
-
-def test_a_film_of_another_ending_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"must end in .mp4, .webp, .gif, .png, got film.avi"):
-        video.check_film(tmp_path / "film.avi")
-
-
-@pytest.mark.parametrize("wrong", [{"width": 642}, {"height": 33}, {"rate": 0}])
-def test_sizes_that_cannot_be_encoded_are_refused(wrong):
-    with pytest.raises(ValueError, match=f"VideoConfig.{next(iter(wrong))} must be"):
-        VideoConfig(**wrong)

@@ -6,31 +6,24 @@ from concurrent.futures import Executor, Future
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 from model import AHEAD, BRIEF
-from pretend import pretend_tuning
 
 from hector_jax.cli import propose, run_folder
-from hector_jax.cli import tune as command
 from hector_jax.cli.flags import Propose, Report, Tune
-from hector_jax.control.reference import named_command
-from hector_jax.control.trajectories import NamedCommand
-from hector_jax.control.weights import expert, nominal, weights_to_vector
+from hector_jax.control.weights import nominal, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import save_tree
 from hector_jax.robot.model import load_robot
-from hector_jax.sim.engine import ENGINES, MUJOCO_C
+from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
-from hector_jax.store.setup import Setup
-from hector_jax.store.tunings import Tuned
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import loss_of
 from hector_jax.walk_tuning import campaign as campaigns
@@ -138,13 +131,6 @@ def test_a_tuning_without_a_part_is_not_continued_with_it(robot, tmp_path, part)
         walks.read_history(whole)
 
 
-def test_an_engine_of_walks_that_is_not_installed_is_refused_before_any_tuning(monkeypatch, robot):
-    missing = ENGINES["drake"]._replace(package="no-such-package")
-    monkeypatch.setitem(ENGINES, "drake", missing)
-    with pytest.raises(InputError, match="engine drake needs no-such-package"):
-        run_folder.trajectories(Tune(walks=12, walk_engine="drake"), robot)
-
-
 def test_the_plain_model_is_not_grounded(robot, pool, in_process):
     one, _, rows = in_process
     losses = [
@@ -219,14 +205,6 @@ def test_gains_that_start_out_of_their_box_are_refused(robot, tmp_path):
 def test_the_numbers_of_the_legs_are_tuned_by_walks_alone(robot):
     with pytest.raises(InputError, match="--tune kp foot_height: only --walks can tune"):
         run_folder.trajectories(Tune(tune=("kp", "foot_height")), robot)
-
-
-def test_too_few_walks_to_move_the_legs_are_reported(monkeypatch, pool, with_legs, capsys):
-    one, _ = with_legs
-    row = walks.Row(np.zeros(25), "start", None, np.ones(1), 0.1)
-    monkeypatch.setattr(walks, "read_history", lambda campaign: [row])
-    walks.tune_on_walks(pool, one, 1)
-    assert "foot_height, kp were not moved" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")
@@ -359,36 +337,3 @@ def test_from_proposal_to_report_by_the_commands(monkeypatch, robot, pool, tmp_p
         propose.report(Report(folder, (log,), processes=1))
     with pytest.raises(InputError, match="nothing was proposed here"):
         propose.report(Report(tmp_path / "other", (log,)))
-
-
-def test_a_run_spends_the_walks_that_were_asked_for(monkeypatch, robot, tmp_path):
-    there = Tuned(pretend_tuning(3, expert()), "")
-    row = walks.Row(np.zeros(19), "start", None, np.ones(2), 0.1)
-    seen = {}
-
-    def on_walks(pool, one, count):
-        seen.update(plants=len(one.plants), commands=list(one.commands), count=count)
-        seen["engine"] = one.engine.name
-        return [row]
-
-    monkeypatch.setattr(
-        command.tunings, "tune_all", lambda _, problems, **__: dict.fromkeys(problems, there)
-    )
-    monkeypatch.setattr(command, "tune_on_walks", on_walks)
-    monkeypatch.setattr(command, "choose_engine", ENGINES.get)  # installed or not
-    monkeypatch.setattr(command, "candidates", lambda *_: {"set 0": nominal(), "set 1": expert()})
-    monkeypatch.setattr(command.choice, "walks_best", lambda _, sets, *__, **___: [*sets][-1])
-    net = SimpleNamespace(params="a net")
-    course = NamedCommand("straight", named_command("straight"))
-    setup, args = (
-        Setup(Executor(), CONFIG, robot),
-        Tune(walks=12, walk_plants=3, walk_engine="drake"),
-    )
-    run = command._Run(setup, tmp_path, args, nominal(), (course,), net)
-    tuned = command._tune_sets(run)
-    assert seen == {"plants": 3, "commands": ["straight"], "count": 12, "engine": "drake"}
-    np.testing.assert_array_equal(tuned.sets["best"].Q.euler, expert().Q.euler)
-    assert (tmp_path / "weights" / "before_walks.json").exists()
-    assert walks.changes_by_walk(tuned.proposals)[0].change == 0.0
-    with pytest.raises(InputError, match=r"--walks must be 0 or at least 6 .*, got 5"):
-        run_folder.trajectories(Tune(walks=5, walk_plants=3), robot)
