@@ -16,12 +16,7 @@ from lib import sample_weights
 from model import mean_of
 
 from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.weights import (
-    directions,
-    nominal,
-    vector_to_weights,
-    weights_to_vector,
-)
+from hector_jax.control.weights import directions, nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.tree import stack
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
@@ -124,23 +119,6 @@ def test_each_tuning_of_a_batch_is_that_of_a_single_one(on_toy, config):
     assert found.history.iteration.shape[1] <= config.iterations + 1
 
 
-def test_a_batch_tunes_other_numbers_as_a_single_tuning_does(monkeypatch):
-    def leaning(config, scenario, weights, loss, *, walk=None):
-        """The bowl, and another in the lead of turns, about 1.2."""
-        found, lead = toy(config, scenario, weights, loss), weights.others["turn_lead"]
-        gradient = found.gradient._replace(others={"turn_lead": 2e6 * (lead - 1.2)})
-        return found._replace(loss=found.loss + 1e6 * (lead - 1.2) ** 2, gradient=gradient)
-
-    use(monkeypatch, leaning)
-    config = replace(TOY, others=("turn_lead",))
-    asked = stack([problem(start, [scenario("c")]) for start in STARTS[:2]])
-    found = tune_batch(config, ROBOT, asked, last_command)
-    for i, start in enumerate(STARTS[:2]):
-        alone = tune(config, alone_on("c"), start)
-        assert abs(alone.weights.others["turn_lead"] - 1.2) < 0.2
-        close(jax.tree.map(lambda x, i=i: x[i], found.weights), alone.weights, rtol=1e-9)
-
-
 def test_how_many_walk_side_by_side_does_not_matter(on_toy):
     asked = stack([problem(w, [scenario("c")]) for w in STARTS])
     one, *others = (tune_batch(TOY, ROBOT, asked, last_command, lanes=lanes) for lanes in (1, 2, 0))
@@ -218,7 +196,6 @@ def test_a_gpu_walks_the_ticks_of_few_rollouts_at_once():
         ({"tail": np.array([1.5])}, r"BatchProblem.tail must be from 0 to 1, got 1.5"),
         ({"tail": np.zeros(0)}, "stacked, one per problem"),
         ({"effect": 3}, r"BatchScenario.effect must be below 1, got 3..3"),
-        ({"scale": 0.0}, "BatchScenario.scale must be positive"),
         (
             {"variation": no_variation()._replace(delay=np.asarray(0.02))},
             "Variation.delay must be from 0 to a tick of 0.01 s, got 0.02",
@@ -315,18 +292,6 @@ def test_two_hosts_give_the_numbers_of_one():
     for host in hosts:
         told, wrong = host.communicate(timeout=300)
         assert told.strip().endswith("same"), wrong[-2000:]
-
-
-@pytest.mark.slow
-def test_a_batch_with_all_ticks_at_once_is_that_of_ticks_in_turn():
-    config = TuneConfig(rollout=RolloutConfig(ticks=40), iterations=2)
-    asked = stack([problem(w, [scenario("s"), scenario("c")]) for w in STARTS[:2]])
-    in_turn, at_once = (
-        tune_batch(config, ROBOT, asked, last_command, lanes=0, walk=walk)
-        for walk in (rollout, parallel_rollout)
-    )
-    np.testing.assert_allclose(at_once.loss, in_turn.loss, rtol=1e-9)
-    np.testing.assert_allclose(vector(at_once.weights), vector(in_turn.weights), rtol=1e-7)
 
 
 @pytest.mark.slow  # minutes of compilation

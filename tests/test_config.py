@@ -91,25 +91,11 @@ def test_the_line_that_asks_again_needs_no_file(tmp_path):
     ("text", "fault"),
     [
         ("sedes = 3", "unknown field 'sedes'; did you mean 'seeds'?"),
-        ("first-sede = 3", "unknown field 'first_sede'; did you mean 'first_seed'?"),
-        ("moon = 3", "unknown field 'moon'; known: config, trajectories, "),
         ('config = "other.toml"', "config stands on the line only"),
-        ("[tune]\nseeds = 3", "unknown field 'tune'"),
         ('seeds = "3"', "seeds must be a whole number from 1 to 10000, got '3'"),
         ("seeds = 3.0", "seeds must be a whole number from 1 to 10000, got 3.0"),
-        ("seeds = true", "seeds must be a whole number from 1 to 10000, got True"),
-        ("seeds = 0", "seeds must be a whole number from 1 to 10000, got 0"),
-        (
-            "first-seed = -1",
-            "first_seed must be a whole number from 0 to 4294967295, got -1",
-        ),
         ("quick = 1", "quick must be true or false, got 1"),
-        ("data = 1", "data must be a path, got 1"),
-        ("kept = []", "kept must be a path, got []"),
         ('trajectories = "c"', "trajectories must be a list, each text, got 'c'"),
-        ("trajectories = [1]", "trajectories must be a list, each text, got [1]"),
-        ("iterations = 0", "iterations must be a whole number from 1 to 10000, got 0"),
-        ("seeds = 1979-05-27", "seeds must be a whole number from 1 to 10000, got datetime.date"),
         ("seeds = ", "not valid TOML: "),
         ("seeds = 1\nseeds = 2", "not valid TOML: "),
     ],
@@ -126,17 +112,9 @@ def test_a_wrong_file_is_one_line_with_file_and_key(tmp_path, text, fault):
     ("key", "fault"),
     [
         ('world = "standing"', "must be 'ideal', 'hfs', .*did you mean 'standin'"),
-        ("world = 3", "world must be 'ideal', .*got 3"),
         ("seconds = 0", "seconds must be a number from 0.01 to 600, got 0"),
-        ("seconds = 601.0", "seconds must be a number from 0.01 to 600, got 601"),
         ("seconds = nan", "seconds must be a number from 0.01 to 600, got nan"),
         (f"seconds = 1{400 * '0'}", "seconds must be a number from 0.01 to 600, got 1000"),
-        (
-            "first-seed = 4294967296",
-            "first_seed must be a whole number from 0 to 4294967295, got 4294967296",
-        ),
-        ("seconds = inf", "seconds must be a number from 0.01 to 600, got inf"),
-        ('seconds = "long"', "seconds must be a number from 0.01 to 600, got 'long'"),
     ],
 )
 def test_choices_and_ranges_hold_in_a_file(tmp_path, key, fault):
@@ -148,17 +126,9 @@ def test_choices_and_ranges_hold_in_a_file(tmp_path, key, fault):
     ("name", "data", "fault"),
     [
         ("run.toml", b"\xff\xfe", "not a text file"),
-        ("run.toml", b"seeds = 1" + b"0" * 5000, "not valid TOML"),
-        ("run.json", b"{", "not valid JSON"),
         ("run.json", b"[]", "no `flags` in it"),
-        ("run.json", b'{"tune": {}}', "no `flags` in it"),
-        (
-            "run.json",
-            b'{"flags": {"seeds": null}}',
-            "seeds must be a whole number.*got None",
-        ),
+        ("run.json", b'{"flags": {"seeds": null}}', "seeds must be a whole number.*got None"),
         ("run.json", b"[" * 100_000, "not valid"),
-        ("run.toml", b"a = " + b"[" * 100_000, "not valid"),
         ("none.toml", None, "No such file"),
     ],
 )

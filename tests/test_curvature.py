@@ -14,13 +14,7 @@ from hector_jax.control.parameters import step_names, stepped
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import direction_names, expert
 from hector_jax.tuning.curvature import determined, gauss_newton
-from hector_jax.tuning.difftune import (
-    TuneConfig,
-    init,
-    model_objective,
-    trial_weights,
-    update,
-)
+from hector_jax.tuning.difftune import TuneConfig, init, model_objective, trial_weights, update
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 

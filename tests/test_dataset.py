@@ -317,10 +317,3 @@ def test_the_legs_get_what_the_wrench_does_not_explain(three, robot):
     feet = jnp.asarray(three.feet[walk, j - 1 : j + 1].mean(axis=0))
     push = srbm.unexplained(robot, before, after, wrench, feet, dt=0.01)
     leaves_close(turn(push, -before.euler[2]), jax.tree.map(lambda x: x[row], data.legs), 1e-8)
-
-
-def test_the_axes_of_samples_do_not_depend_on_what_was_measured(robot):
-    data, _ = make_dataset(robot, stack([synthetic_walk(0, 12)]))
-    still = data._replace(label=jax.tree.map(np.zeros_like, data.label))
-    few = jax.tree.map(lambda x: x[:1], still)
-    assert (data.axes, still.axes, few.axes) == (6, 6, 6)

@@ -52,11 +52,6 @@ def test_auto_is_mjx_where_there_is_an_accelerator(monkeypatch):
         assert (engine.bits(False), engine.bits(True)) == (bits, 64)
 
 
-def test_an_unknown_engine_is_refused_by_name():
-    with pytest.raises(InputError, match="engine must be 'auto', 'c', .*, got 'mjxx'.*'mjx'"):
-        choose_engine("mjxx")
-
-
 def test_an_engine_that_is_not_installed_says_what_to_install(monkeypatch):
     monkeypatch.setitem(ENGINES, "drake", ENGINES["drake"]._replace(package="no-such-package"))
     expected = (
@@ -75,10 +70,8 @@ def test_an_engine_that_is_not_installed_says_what_to_install(monkeypatch):
             "from pinocchio.pinocchio_pywrap_default import *",
             "pinocchio cannot be loaded from {}: No module named 'pinocchio.pinocchio_pywrap_",
         ),
-        ("pinocchio", "pin", "import nose_of_old", "pinocchio cannot be loaded from {}: No module"),
         ("pinocchio", "pin", "", "Pinocchio (pip install 'pin>=4.1') is expected, {} is another"),
         ("drake", "drake", "raise ImportError('of 3.10')", "pydrake cannot be loaded from {}: of"),
-        ("drake", "drake", "", "pydrake cannot be loaded from {}: cannot import name 'geometry'"),
     ],
 )
 def test_an_engine_of_another_python_or_of_other_people_is_named(

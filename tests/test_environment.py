@@ -9,9 +9,6 @@ import time
 
 import pytest
 
-from hector_jax.core import runtime
-from hector_jax.robot.model import load_robot
-
 # without the flags of the tests
 USUAL = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
 WRONG = [
@@ -58,13 +55,6 @@ def test_a_renderer_is_needed_for_a_film_alone(tmp_path):
     assert (done.returncode, done.stderr.splitlines()[-1]) == (2, line)
 
 
-def test_workers_need_no_renderer(monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", "crayon")
-    with runtime.workers(1) as pool:
-        assert pool.submit(load_robot).result().mass > 0.0
-    assert os.environ["MUJOCO_GL"] == "crayon"
-
-
 # Streams and signals
 
 TOY = """
@@ -81,10 +71,8 @@ sys.exit(exit_code("toy", work))
     ("redirected", "code", "out", "err"),
     [
         (">&-", 0, "", "working\n"),
-        ("2>&-", 0, "result\n", ""),
         ("<&- >&- 2>&-", 0, "", ""),
         (">/dev/full", 1, "", "working\ntoy: cannot write the output: No space left on device\n"),
-        (">/dev/full 2>/dev/full", 1, "", ""),
     ],
 )
 def test_streams_that_are_closed_or_full_cost_at_most_a_line(redirected, code, out, err):
@@ -107,9 +95,7 @@ sys.exit(console.exit_code("toy", work))
 """
 
 
-@pytest.mark.parametrize(
-    ("number", "word"), [(signal.SIGTERM, "terminated"), (signal.SIGINT, "interrupted")]
-)
+@pytest.mark.parametrize(("number", "word"), [(signal.SIGTERM, "terminated")])
 def test_a_signal_ends_a_program_that_hangs_in_compiled_code(number, word):
     toy = subprocess.Popen(
         [sys.executable, "-c", DEAF], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

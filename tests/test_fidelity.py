@@ -3,7 +3,6 @@
 import json
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from model import SHORT
@@ -15,7 +14,6 @@ from hector_jax.grfm.dataset import at_interval, make_dataset
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.training import errors, errors_by_phi
 from hector_jax.report import fidelity
-from hector_jax.report.report import Picture
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.rollout import rollout
 
@@ -35,12 +33,7 @@ def samples(robot):
 def walks(robot):
     """A walk of the rigid body itself, on ground that returns what is commanded."""
     one = jax.jit(rollout, static_argnums=0)(
-        SHORT,
-        robot,
-        nominal(),
-        named_command("straight"),
-        standing_anchor(robot),
-        last_command,
+        SHORT, robot, nominal(), named_command("straight"), standing_anchor(robot), last_command
     )
     return jax.tree.map(lambda x: np.asarray(x)[None], one)
 
@@ -94,24 +87,6 @@ def test_what_follows_a_fall_is_not_predicted(robot, walks):
     short = walks._replace(fallen=walks.fallen[:, :30])
     with pytest.raises(ValueError, match="30 ticks are too short to predict 40 ticks"):
         fidelity.drift(robot, last_command, short, np.zeros(1, int))
-
-
-def test_the_report_holds_every_world_and_phi(tmp_path, samples, drifts):
-    effects = {"raw": last_command}
-    found = fidelity.as_result(
-        errors_by_phi(effects, samples), fidelity.by_phase(effects, samples), drifts
-    )
-    worlds = {"hfs": found, "standin": found}
-    text = fidelity.write_report(tmp_path, worlds, [Picture("a.png", "A picture.")]).read_text()
-    assert "## hfs" in text
-    assert "## hardware stand-in" in text
-    assert "![A picture.](a.png)" in text
-    assert "measured" in text
-    for block in text.split("\n\n"):
-        rows = [row for row in block.splitlines() if row.startswith("|")]
-        assert len({row.count("|") for row in rows}) <= 1, block
-    assert (tmp_path / "result.json").exists()
-    assert jnp.isfinite(found["open_loop"]["raw"]["0.4 s"]["euler"])
 
 
 def test_what_nothing_was_measured_of_is_null_and_a_dash(tmp_path, robot, samples, walks):

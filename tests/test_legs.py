@@ -265,8 +265,3 @@ def test_torques_stay_within_their_limits(sign):
         assert (np.abs(found) <= ROBOT.torque_limit).all()
         assert (np.abs(found) == ROBOT.torque_limit).any()
     np.testing.assert_array_equal(found, sign * ROBOT.torque_limit)
-
-
-def test_impossible_gains_are_refused():
-    with pytest.raises(ValueError, match=r"LegConfig.kd must be "):
-        LegConfig(kd=(1.0, 1.0, -1.0, 1.0, 1.0))

@@ -21,14 +21,7 @@ from hector_jax.control.contact import (
     StateConstraint,
 )
 from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
-from hector_jax.control.mpc import (
-    Horizon,
-    MpcConfig,
-    MpcProblem,
-    build_qp,
-    half_slope,
-    solve_mpc,
-)
+from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, build_qp, half_slope, solve_mpc
 from hector_jax.control.parameters import bounds
 from hector_jax.control.weights import (
     Weights,

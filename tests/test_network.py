@@ -17,13 +17,7 @@ from hector_jax.grfm import paper, residual
 from hector_jax.grfm.dataset import ACROSS, ALONG, at_interval, make_dataset, with_mirror
 from hector_jax.grfm.effect import HISTORY, Window, last_command
 from hector_jax.grfm.gated import fit_gated, hats
-from hector_jax.grfm.network import (
-    as_effect,
-    effect_of,
-    load_net,
-    save_net,
-    variant_of,
-)
+from hector_jax.grfm.network import as_effect, effect_of, load_net, save_net, variant_of
 from hector_jax.grfm.paper import fit_linear, fit_scaling
 from hector_jax.grfm.residual import BOUND, plain_net
 from hector_jax.grfm.training import predict

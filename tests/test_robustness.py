@@ -9,18 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pretend import pretend_score
-from scenes import (
-    DIRECTIONS,
-    Level,
-    SceneConfig,
-    evaluate_level,
-    make_scenes,
-    significant,
-)
+from scenes import DIRECTIONS, Level, SceneConfig, evaluate_level, make_scenes, significant
 
-from hector_jax.control.weights import nominal
 from hector_jax.core.tree import stack
-from hector_jax.sim.world import hfs
 
 ROOT = Path(__file__).parents[1]
 SMALL = SceneConfig(forces=(50.0, 100.0), frictions=(0.4, 0.2), phases=3)
@@ -44,16 +35,6 @@ def test_pushes_come_from_eight_sides_at_all_phases_of_a_cycle():
     start = np.array([scene.push.start[0] for scene in found[:3]])
     np.testing.assert_allclose((start - start[0]) / 0.4, [0, 1 / 3, 2 / 3])
     assert all(scene.push.start[0] + 1.0 < scene.seconds for scene in found)
-
-
-def test_a_scene_becomes_the_walk_of_a_set_on_a_plant():
-    scenes = make_scenes(SMALL, "straight")
-    scene = scenes[Level("slope", "up")][0]
-    job = scene.job(nominal(), hfs(), 7)
-    assert (job.seed, job.seconds, job.push) == (7, scene.seconds, scene.push)
-    slow = scenes[Level("delay", 8.0)][0].job(nominal(), hfs(), 7).imperfections
-    assert (slow.delay, slow.lag) == (0.008, 0.006)
-    assert slow.estimator.velocity > 0.0
 
 
 def test_a_set_is_judged_by_the_median_of_paired_ratios():

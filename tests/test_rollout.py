@@ -17,13 +17,7 @@ from hector_jax.grfm.dataset import make_dataset
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.curvature import gauss_newton_jit
-from hector_jax.tuning.difftune import (
-    TuneConfig,
-    init,
-    step_status,
-    tune,
-    tune_step,
-)
+from hector_jax.tuning.difftune import TuneConfig, init, step_status, tune, tune_step
 from hector_jax.tuning.evaluate import evaluate_jit, gradient_norms
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
@@ -221,11 +215,7 @@ def test_gradient_over_50_ticks_is_that_of_differences(robot, anchor):
 def cases(robot, anchor, net):
     """Random weights for each trajectory, with phi the identity and the net."""
     return [
-        (
-            (name, said),
-            random_weights(seed),
-            Scenario(robot, named_command(name), anchor, effect),
-        )
+        ((name, said), random_weights(seed), Scenario(robot, named_command(name), anchor, effect))
         for seed, name in enumerate(COMMANDS)
         for said, effect in (("plain", PLAIN), ("net", net))
     ]
@@ -263,11 +253,6 @@ def test_the_way_back_solves_no_qp_again(robot, anchor):
     functions = lowered.as_text().split("func.func")
     solving = [f for f in functions if "solve_normal" in f.splitlines()[0] and ".while" in f]
     assert len(solving) == 1
-
-
-def test_a_block_has_at_least_one_tick():
-    with pytest.raises(ValueError, match="block must be a whole number of at least 1"):
-        RolloutConfig(block=0)
 
 
 def test_new_weights_commands_and_effects_need_no_compilation(robot, anchor):

@@ -178,12 +178,7 @@ def test_a_record_of_another_search_is_refused(tmp_path):
 
 @pytest.mark.parametrize(
     ("line", "says"),
-    [
-        (b"{}\n", "line 3 is damaged"),
-        (b'{"steps": [[0]], "losses": [1]}\n', "expected"),
-        (b"\xff\n", "line 3 is damaged"),
-        (b"[1, 2]\n", "line 3 is damaged"),
-    ],
+    [(b"{}\n", "line 3 is damaged"), (b'{"steps": [[0]], "losses": [1]}\n', "expected")],
 )
 def test_a_damaged_record_is_refused(tmp_path, line, says):
     run(tmp_path)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from model import BEST_OTHERS, CONFIG, ROBOT
 from pretend import pretend_tuning
-from synthetic import synthetic_walk
 
 from hector_jax.cli import run_folder
 from hector_jax.cli import tune as command
@@ -24,7 +23,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.store import tunings
 from hector_jax.store.setup import Setup
 from hector_jax.store.tunings import Tuned
-from hector_jax.tuning.loss import alphas, between_loss
+from hector_jax.tuning.loss import alphas
 from hector_jax.verdict import choice
 
 
@@ -70,15 +69,6 @@ def test_the_numbers_of_best_follow_robot_controller_and_start(monkeypatch, tmp_
     save_weights(tmp_path / "start.json", start)
     others = load_weights(tmp_path / "start.json").others  # in their boxes
     assert others == {**BEST_OTHERS, "position_limit": 10.0, "footstep_width": 0.2}
-
-
-def test_changes_between_switches_are_those_of_control_without_switches():
-    walk = synthetic_walk(0, 60)
-    wrench = np.concatenate([walk.command.force, walk.command.moment], axis=-1)
-    changes = np.sum(np.diff(wrench, axis=0) ** 2, axis=(1, 2))
-    stays = np.all(walk.contact[1:] == walk.contact[:-1], axis=-1)
-    assert 0 < stays.sum() < len(stays)
-    assert float(between_loss(walk)) == pytest.approx(changes[stays].sum())
 
 
 def test_a_limit_of_the_position_error_is_set_once():

@@ -5,14 +5,7 @@ import pytest
 from oracles import pack_state
 
 from hector_jax.core.geometry import euler_from_rotation, rot_z, rotation_from_euler, skew
-from hector_jax.core.trajectory import (
-    Load,
-    State,
-    Wrench,
-    pack_wrench,
-    unpack_wrench,
-    zero_wrench,
-)
+from hector_jax.core.trajectory import Load, State, Wrench, pack_wrench, unpack_wrench, zero_wrench
 from hector_jax.robot import srbm
 from hector_jax.robot.model import load_robot
 

@@ -80,12 +80,6 @@ def test_a_step_is_that_of_the_secular_equation(ridge, radius):
         np.testing.assert_allclose(step, damped(damping), rtol=1e-6, atol=1e-8 * radius)
 
 
-@pytest.mark.parametrize("rank", [0, 2, 6])
-def test_without_a_gradient_there_is_no_step(rank):
-    step, _ = begun(0.0, np.zeros(6), positive(0, rank))
-    np.testing.assert_array_equal(step, np.zeros(6))
-
-
 def test_a_step_does_not_depend_on_the_unit_of_the_loss():
     g, H = np.array([1.0, -2.0]), np.array([[2.0, 0.5], [0.5, 1.0]])
     one, other = (begun(0.1, k * g, k * H, k)[0] for k in (1.0, 1e9))

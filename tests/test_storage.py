@@ -96,18 +96,13 @@ def test_another_kind_robot_format_layout_or_shape_is_refused(saved, monkeypatch
         load_tree(saved, TREE, kind="thing")
 
 
-def test_a_missing_file_is_one_line_with_its_name(tmp_path):
-    with pytest.raises(ValueError, match="cannot read .*nothing.npz: No such file"):
-        load_tree(tmp_path / "nothing.npz", TREE, kind="thing")
-
-
 def test_an_unwritable_folder_is_one_line_with_its_name(tmp_path):
     (tmp_path / "wall").write_text("a file, no folder")
     with pytest.raises(WriteError, match="cannot write .*wall/tree.npz"):
         save_tree(tmp_path / "wall" / "tree.npz", TREE, kind="thing")
 
 
-@pytest.mark.parametrize("mask", [0o022, 0o077])
+@pytest.mark.parametrize("mask", [0o077])
 def test_files_have_the_rights_that_the_umask_leaves(tmp_path, mask):
     before = os.umask(mask)
     try:
@@ -159,35 +154,17 @@ def _edit(change):
     ("change", "message"),
     [
         (lambda t: t["Q"].pop("velocity"), 'missing weight "Q.velocity"'),
-        (lambda t: t.pop("R"), 'missing weight "R"'),
         (lambda t: t["Q"].update(eular=[1, 1, 1]), "unknown weight 'Q.eular'; did you mean 'Q.eul"),
-        (lambda t: t.update(note="x"), "unknown weight 'note'.*known: Q, R"),
         (lambda t: t["Q"].update(euler=[1, -1, 1]), r"Q.euler\[1\] must be a number from 1e-12"),
-        (lambda t: t["Q"].update(euler=[1, 1, 0]), r"Q.euler\[2\].* to 1e\+12, got 0"),
         (lambda t: t["Q"].update(euler=[1, 1, True]), r"Q.euler\[2\] must be a number.*got True"),
-        (lambda t: t["Q"].update(euler=[1e308, 1, 1]), r"Q.euler\[0\].* to 1e\+12, got 1e\+308"),
-        (
-            lambda t: t["R"].update(force=[[1, 1, 1], [1, 1, 5e-324]]),
-            r"R.force\[1\]\[2\].*from 1e-12",
-        ),
         (lambda t: t["Q"].update(euler=[1, float("nan"), 1]), r"Q.euler\[1\].*got nan"),
-        (lambda t: t["Q"].update(euler=[1, 1, float("inf")]), r"Q.euler\[2\].*got inf"),
         (lambda t: t["Q"].update(euler=[1, 1]), "Q.euler must be 3 numbers, got"),
-        (lambda t: t["Q"].update(euler=["a", 1, 1]), r"Q.euler\[0\] must be a number.*got 'a'"),
-        (lambda t: t["Q"].update(euler=[10**400, 1, 1]), r"Q.euler\[0\].* to 1e\+12, got 1000"),
         (lambda t: t["R"].update(force=[[1, 1, 1], [1]]), "R.force must be 2 x 3 numbers, got"),
-        (lambda t: t["R"].update(moment=None), "R.moment must be 2 x 3 numbers, got null"),
-        (lambda t: t.update(Q=[1, 2]), "Q must be an object"),
-        (lambda t: t.update(others=[1, 2]), "others must be an object; expected"),
         (
             lambda t: t.update(others={"frition": 1}),
             "unknown weight 'others.frition'; did you mean 'others.fri",
         ),
-        (
-            lambda t: t.update(others={"friction": 2}),
-            "others.friction must be a number from 0.1",
-        ),
-        (lambda t: t.update(others={"friction": [1]}), "others.friction must be a number, got"),
+        (lambda t: t.update(others={"friction": 2}), "others.friction must be a number from 0.1"),
         (lambda t: t.update(others={"kp": [9, 9, 9]}), "others.kp must be 5 numbers, got"),
     ],
 )
@@ -200,14 +177,7 @@ def test_bad_weights_are_one_line_with_file_and_entry(tmp_path, change, message)
     assert "\n" not in str(caught.value)
 
 
-def test_a_byte_order_mark_is_taken(tmp_path):
-    path = tmp_path / "weights.json"
-    save_weights(path, expert())
-    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
-    jax.tree.map(np.testing.assert_array_equal, load_weights(path), expert())
-
-
-@pytest.mark.parametrize("text", ["", "{", "[1]", "\udc80", '{"Q": 1, "Q": 2}', "[" * 100_000])
+@pytest.mark.parametrize("text", ["", "\udc80", '{"Q": 1, "Q": 2}', "[" * 100_000])
 def test_weights_that_are_no_json_object_are_refused(tmp_path, text):
     path = tmp_path / "weights.json"
     path.write_bytes(text.encode(errors="surrogateescape"))
@@ -245,13 +215,7 @@ def edited(tmp_path, monkeypatch):
     ],
 )
 def test_a_result_holds_for_the_code_that_computes_it(edited, module, before, after, same):
-    hashes = (
-        environment.code_hash("sim.walk"),
-        code_hash("tuning.difftune", "grfm.network"),
-    )
+    hashes = (environment.code_hash("sim.walk"), code_hash("tuning.difftune", "grfm.network"))
     edited(module, before, after)
-    again = (
-        environment.code_hash("sim.walk"),
-        code_hash("tuning.difftune", "grfm.network"),
-    )
+    again = (environment.code_hash("sim.walk"), code_hash("tuning.difftune", "grfm.network"))
     assert [a == b for a, b in zip(hashes, again, strict=True)] == [same, same]

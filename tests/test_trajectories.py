@@ -65,27 +65,15 @@ HEAD = 'name = "mine"\n[[segment]]\nseconds = 1.0\n'
     [
         ("", ["missing field 'name'", "known: name, segment"]),
         ('name = "mine"', ["missing field 'segment'"]),
-        ('name = "mine"\nsegment = []', ["[[segment]] must be given at least once"]),
-        ('name = "mine"\nsegment = 3', ["segment must be a list, got 3"]),
-        ('name = "mine"\nsegment = [3]', ["segment 1 must be a table of seconds, v_x"]),
         ("name = 3\nsegment = [{seconds = 1}]", ["name must be text, got 3"]),
-        ('name = "../up"\nsegment = [{seconds = 1}]', ["name must be 1 to 40", "'../up'"]),
         ('name = "s"\nsegment = [{seconds = 1}]', ["built-in trajectory", "'s'"]),
         (HEAD + "vx = 0.3", ["segment 1: unknown field 'vx'; did you mean 'v_x'", "yaw_rate"]),
         (HEAD + "v_x = nan", ["segment 1: v_x must be a number", "to 10, got nan"]),
-        (HEAD + "v_y = inf", ["segment 1: v_y must be a number", "got inf"]),
-        (HEAD + "v_x = 500", ["from -10 to 10, got 500"]),
         (HEAD + 'yaw_rate = "fast"', ["yaw_rate must be a number", "to 10, got 'fast'"]),
-        (HEAD + "yaw_rate = true", ["yaw_rate must be a number", "got True"]),
-        (HEAD + f"v_x = {10**400}", ["v_x must be a number"]),
         (HEAD + f"v_x = 0x{'f' * 9000}", ["v_x must be a number", "too many digits"]),
         (HEAD + "[[segment]]\nv_x = 1.0", ["segment 2: missing field 'seconds'"]),
         (HEAD + "[[segment]]\nseconds = -1", ["segment 2: seconds must be", "0.05", "got -1"]),
-        (HEAD + "[[segment]]\nseconds = 0.07", ["multiple of 0.05 s, got 0.07"]),
-        (HEAD + "v_x == 3", ["not valid TOML", "line 4"]),
         (HEAD + "[[segment]]\nseconds = 600", ["at most 600 s together, got 601"]),
-        (HEAD + "x = " + "[" * 9000, ["not valid TOML"]),
-        ("#" * 10_000_001, ["10.0 MB, expected at most 10 MB"]),
     ],
 )
 def test_wrong_files_are_refused_by_file_field_value_and_range(tmp_path, text, words):
@@ -124,8 +112,6 @@ def test_built_in_trajectories_are_within_the_limits(name):
     ("rows", "told"),
     [
         ([(2.0, 0.0, 0.0)], "segment 1: v_x is 2 m/s; .* walk -1 to 1.6 m/s"),
-        ([(0.5, 0.0, 0.0), (0.0, -1.5, 0.0)], "segment 2: v_y is -1.5 m/s"),
-        ([(0.0, 0.0, 5.0)], "segment 1: yaw_rate is 5 rad/s"),
         ([(1.2, 0.0, 0.0), (-0.8, 0.0, 0.0)], "segment 2: the change of v_x is -2 m/s"),
     ],
 )

@@ -1,8 +1,5 @@
 """Films: poses are those that were walked, and no machine's missing back end ends a run."""
 
-import pickle
-from pathlib import Path
-
 import imageio_ffmpeg
 import mujoco
 import numpy as np
@@ -12,7 +9,7 @@ from pretend import pretend_walk
 from scipy.spatial.transform import Rotation
 
 from hector_jax.core.trajectory import State
-from hector_jax.report import render, video
+from hector_jax.report import render
 from hector_jax.report.motion import motion, motions, poses
 from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film, write_strip
 from hector_jax.robot.description import MODEL_PATH
@@ -98,25 +95,3 @@ def test_no_back_end_costs_one_line(robot, tmp_path, monkeypatch):
         write_film(tmp_path / "film.mp4", robot, walks)
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("name", ["film.mp4", "film.webp"])
-def test_back_ends_are_tried_in_turn_until_one_draws(robot, tmp_path, monkeypatch, name):
-    tried = []
-    drawn = f"drawn{Path(name).suffix}"
-
-    def draw(folder, back_end):
-        tried.append(back_end)
-        if back_end == "egl":
-            return "no device"
-        scene = pickle.loads((folder / "scene.pickle").read_bytes())
-        assert str(scene.file) == drawn
-        (folder / drawn).write_bytes(b"film")
-        return ""
-
-    monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(video, "_draw_in_child", draw)
-    walks = dict.fromkeys("ab", motion(robot, pretend_walk(seconds=0.1)))
-    assert write_film(tmp_path / name, robot, walks) == "osmesa"
-    assert tried == ["egl", "osmesa"]
-    assert (tmp_path / name).read_bytes() == b"film"

@@ -99,13 +99,6 @@ def test_wrenches_of_the_yaw_frame_are_turned_into_the_world(robot):
     np.testing.assert_allclose(drawn, 5 / 6 * np.array(ahead), atol=1e-9)
 
 
-def test_each_touchdown_leaves_one_sole_of_the_feet_length(robot):
-    found = motion(robot, *viewed(seconds=4.0))
-    assert len(found.soles) == 20
-    length = np.linalg.norm(found.soles[:, 1] - found.soles[:, 0], axis=1)
-    np.testing.assert_allclose(length, robot.toe + robot.heel)
-
-
 def test_both_walks_stand_on_one_reference_wherever_they_began(robot):
     one = viewed(seconds=0.5, turn=1.0)
     found = motion(robot, *one)
@@ -129,14 +122,6 @@ def test_metrics_are_read_back_as_they_were_written(tmp_path):
     assert curve[6] < curve[0]
 
 
-def test_a_line_that_is_being_written_is_left_for_later(tmp_path):
-    write_metrics(tmp_path, 4)
-    whole = runs.read_histories(tmp_path)
-    with (tmp_path / "metrics.jsonl").open("a") as file:
-        file.write('{"set": "with", "itera')
-    assert len(runs.read_histories(tmp_path)["with"]) == len(whole["with"])
-
-
 def test_a_damaged_line_is_named(tmp_path):
     write_metrics(tmp_path, 4)
     text = (tmp_path / "metrics.jsonl").read_text().replace('"iteration": 2', '"number": 2', 1)
@@ -154,13 +139,6 @@ def test_a_run_that_goes_on_lends_its_newest_weights(tmp_path):
     weights, told = runs.weights_of(run, "with")
     np.testing.assert_array_equal(weights_to_vector(weights), weights_to_vector(expert()))
     assert told == "with"
-
-
-def test_an_unknown_set_is_told_those_that_there_are(tmp_path):
-    run = pretend_run(tmp_path, weights=["with_walks"])
-    expected = "no weight set 'witth'; it has expert, nominal, with, with_walks, without"
-    with pytest.raises(ValueError, match=expected):
-        runs.weights_of(run, "witth")
 
 
 def refused(monkeypatch, capsys, *arguments):

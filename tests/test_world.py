@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from hector_jax.robot.description import Description
 from hector_jax.robot.model import load_robot, quiet_mujoco
 from hector_jax.sim.actuators import init_actuators, step_actuators
 from hector_jax.sim.standin import standin
@@ -17,14 +16,12 @@ from hector_jax.sim.world import (
     NO_PUSH,
     Push,
     build_world,
-    build_worlds,
     hfs,
     hfs_drawn,
     hfs_even,
     hfs_varied,
     hfs_with_motors,
     ideal,
-    named_world,
     noisy,
     push_force,
     standing_qpos,
@@ -81,12 +78,6 @@ def test_a_push_lasts_from_its_start_on_and_pushes_add_up():
     assert not np.any(push_force(NO_PUSH, jnp.array(0)))
 
 
-def test_what_is_only_looked_at_is_no_part_of_a_world():
-    model = build_world(hfs()).model
-    assert np.all(model.geom_contype | model.geom_conaffinity)
-    assert (model.ngeom, model.ntex, model.nmat) == (12, 0, 0)
-
-
 def test_joints_are_found_by_name_with_and_without_backlash():
     for plant in (ideal(), hfs()):
         world = build_world(plant)
@@ -106,14 +97,6 @@ def test_backlash_adds_a_free_play_that_the_encoder_does_not_see():
     slack = data.qpos[world.model.jnt_qposadr[world.slack]]
     assert abs(slack[KNEE]) == pytest.approx(width, rel=0.15)
     assert np.abs(slack).max() < 1.2 * width
-
-
-def test_the_play_of_a_joint_is_free_of_all_but_a_little_damping():
-    world = build_world(hfs())
-    joints = [world.model.joint(f"{name}_backlash") for name in ROBOT.description.joints]
-    for joint in joints:
-        assert (joint.stiffness[0], joint.frictionloss[0], joint.armature[0]) == (0.0, 0.0, 0.0)
-        assert joint.damping[0] == 0.01
 
 
 def test_joint_friction_holds_against_a_small_torque():
@@ -268,32 +251,10 @@ def test_a_seed_is_a_plant():
         assert (same[0] != same[2]).any()
 
 
-def test_plants_built_together_equal_plants_built_alone():
-    plants = [hfs_varied(0), ideal(), hfs_varied(1)]
-    for plant, world in zip(plants, build_worlds(plants), strict=True):
-        alone = build_world(plant).model
-        for field in ("dof_damping", "dof_frictionloss", "body_mass", "jnt_range", "geom_solref"):
-            np.testing.assert_array_equal(getattr(world.model, field), getattr(alone, field))
-
-
 def test_a_wrong_number_is_refused_by_name():
     for name, value in (("joint_friction", -1.0), ("mass", 0.0), ("delay", 0.1), ("lag", np.nan)):
         with pytest.raises(ValueError, match=f"Imperfections.{name}"):
             build_world(ideal()._replace(**{name: np.array(value)}))
-
-
-def test_an_unknown_world_is_refused():
-    known = "ideal, hfs, hfs-varied, hfs-even"
-    with pytest.raises(ValueError, match=f"unknown world 'mars'; known: {known}"):
-        named_world("mars")
-
-
-def test_a_broken_file_is_refused_in_one_line(tmp_path):
-    broken = tmp_path / "broken.xml"
-    broken.write_text("<mujoco><worldbody>")
-    with pytest.raises(ValueError, match="broken.xml") as caught:
-        build_world(ideal(), Description(broken))
-    assert "\n" not in str(caught.value)
 
 
 def test_a_blown_up_state_stays_blown_up_and_leaves_no_log(tmp_path, monkeypatch):
