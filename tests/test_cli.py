@@ -267,6 +267,12 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     assert "- turn_lead: 0.5 at the start" in Path("both/report.md").read_text()
     assert "walking: straight, c" in Path("both/report.md").read_text()
 
+    # the nets of these data
+    assert call(monkeypatch, "grfm", "--seeds", "0", "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert {"raw", "paper", "residual"} <= told["worlds"]["hfs"]["errors"].keys()
+    assert (tmp_path / told["report"]).exists()
+
 
 @pytest.mark.slow
 def test_the_table_is_made_and_made_again_without_a_walk(monkeypatch, capsys, tmp_path):

@@ -39,7 +39,7 @@ from hector_jax.tuning.difftune import (
 )
 from hector_jax.tuning.evaluate import Evaluation, Objective, aligned
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
-from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.rollout import RolloutConfig, Scenario
 from hector_jax.tuning.status import StepStatus, Stop, status_text
 
 ROBOT = load_robot()
@@ -351,7 +351,7 @@ def test_ten_iterations_go_below_a_hundred_of_the_papers_inside_the_box():
     lower, upper = map(vector, bounds())
     papers = TuneConfig(rule="relative", iterations=100)
     for name in COMMANDS:
-        inputs = ROBOT, nominal(), named_command(name), ANCHOR, last_command
+        inputs = Scenario(ROBOT, named_command(name), ANCHOR, last_command), nominal()
         found, with_ridge = tune(TuneConfig(ridge=0.0), *inputs), tune(TuneConfig(), *inputs)
         history = found.iterations
         assert len(history) <= 11, name

@@ -17,7 +17,7 @@ from hector_jax.robot.model import load_robot
 from hector_jax.sim.engine import ENGINES, MJX, MUJOCO_C, Engine, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import ideal
-from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 
 
 def walk_rigid(pool, config, robot, jobs, *, exact=True, batch=0):
@@ -26,8 +26,8 @@ def walk_rigid(pool, config, robot, jobs, *, exact=True, batch=0):
     for job in jobs:
         rollout_config = RolloutConfig(config, ticks=round(job.seconds / config.gait.tick))
         anchor = standing_anchor(robot, job.start_tick)
-        known = job.weights, job.command, anchor, last_command
-        yield jax.device_get(walked(rollout_config, robot, *known))
+        scenario = Scenario(robot, job.command, anchor, last_command)
+        yield jax.device_get(walked(rollout_config, scenario, job.weights))
 
 
 RIGID = Engine("rigid", "rigid body", walk_rigid, lambda exact: 64)

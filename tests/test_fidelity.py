@@ -15,7 +15,7 @@ from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.training import errors, errors_by_phi
 from hector_jax.report import fidelity
 from hector_jax.robot.model import load_robot
-from hector_jax.tuning.rollout import rollout
+from hector_jax.tuning.rollout import Scenario, rollout
 
 
 @pytest.fixture(scope="module")
@@ -32,9 +32,8 @@ def samples(robot):
 @pytest.fixture(scope="module")
 def walks(robot):
     """A walk of the rigid body itself, on ground that returns what is commanded."""
-    one = jax.jit(rollout, static_argnums=0)(
-        SHORT, robot, nominal(), named_command("straight"), standing_anchor(robot), last_command
-    )
+    scenario = Scenario(robot, named_command("straight"), standing_anchor(robot), last_command)
+    one = jax.jit(rollout, static_argnums=0)(SHORT, scenario, nominal())
     return jax.tree.map(lambda x: np.asarray(x)[None], one)
 
 

@@ -21,7 +21,7 @@ from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk
-from hector_jax.sim.world import NO_PUSH, Push, build_world, build_worlds, hfs, hfs_drawn, ideal
+from hector_jax.sim.world import Push, build_world, build_worlds, hfs, hfs_drawn, ideal
 
 CONFIG, ROBOT = WalkConfig(), load_robot()
 

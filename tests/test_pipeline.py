@@ -1,5 +1,6 @@
 """A net is reused only for its own walks and controller; a loss is one number on either engine."""
 
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -196,10 +197,12 @@ def test_drawn_models_with_which_the_start_falls_are_left_out(robot, monkeypatch
 
 
 def test_a_tuning_that_fails_is_told_while_others_go_on(tmp_path, monkeypatch, robot):
+    told = threading.Event()
+
     def tune(setup, start, problem, put):
         if problem.commands is falls:
             raise InputError("the starting weights fall")
-        time.sleep(20.0)
+        told.wait(60.0)
 
     monkeypatch.setattr(tunings, "_tune_on_cpu", tune)
     falls, walks = (named_command("s"),), (named_command("c"),)
@@ -207,8 +210,9 @@ def test_a_tuning_that_fails_is_told_while_others_go_on(tmp_path, monkeypatch, r
     begin, pool = time.monotonic(), ThreadPoolExecutor(2)
     with pytest.raises(InputError, match="the starting weights fall"):
         tunings.tune_all(Setup(pool, TuneConfig(), robot), problems, tmp_path, title="tuning")
-    assert time.monotonic() - begin < 15.0
-    pool.shutdown(wait=False)
+    assert time.monotonic() - begin < 30.0
+    told.set()
+    pool.shutdown()
 
 
 @pytest.mark.slow

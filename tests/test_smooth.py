@@ -1,7 +1,6 @@
 """Flags of a tuning that make `best` smoother or safer."""
 
 from concurrent.futures import Executor
-from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
@@ -13,12 +12,9 @@ from pretend import pretend_tuning
 from hector_jax.cli import run_folder
 from hector_jax.cli import tune as command
 from hector_jax.cli.flags import Tune
-from hector_jax.control.footstep import FootstepConfig
-from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.parameters import GROUPS
 from hector_jax.control.trajectories import command_of
 from hector_jax.control.weights import nominal
-from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.store import tunings
 from hector_jax.store.setup import Setup
@@ -55,20 +51,6 @@ def test_best_alone_is_tuned_smoothly_on_drawn_models_with_its_own_numbers(monke
     assert config.others == GROUPS["integral"]
     assert (config.rollout, problem.draws) == (CONFIG.rollout, choice.DRAWS)
     jax.tree.map(np.testing.assert_array_equal, start[:2], nominal()[:2])
-
-
-def test_the_numbers_of_best_follow_robot_controller_and_start(monkeypatch, tmp_path):
-    tall = ROBOT._replace(standing_height=2 * ROBOT.standing_height)
-    seen = _tunings(monkeypatch, tmp_path / "tall", Tune(smooth=0.0), tall)
-    assert seen["best"][1].others["position_limit"] == 0.161
-    assert alphas(seen["best"][0].loss) == alphas(CONFIG.loss)  # no price, no term
-    own = {"mpc": MpcConfig(position_limit=20.0), "footstep": FootstepConfig(width=0.3)}
-    rollout = replace(CONFIG.rollout, walk=replace(CONFIG.rollout.walk, **own))
-    config = replace(CONFIG, rollout=rollout)
-    start = _tunings(monkeypatch, tmp_path / "own", Tune(), config=config)["best"][1]
-    save_weights(tmp_path / "start.json", start)
-    others = load_weights(tmp_path / "start.json").others  # in their boxes
-    assert others == {**BEST_OTHERS, "position_limit": 10.0, "footstep_width": 0.2}
 
 
 def test_a_limit_of_the_position_error_is_set_once():
