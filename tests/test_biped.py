@@ -18,10 +18,9 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.files import write_json
-from hector_jax.core.inputs import InputError
 from hector_jax.export.export import find_weights
 from hector_jax.grfm.collection import load_walks
-from hector_jax.robot.description import Description, TuningSettings
+from hector_jax.robot.description import Description
 from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.loop import Job
@@ -31,7 +30,6 @@ from hector_jax.store import folder as runs
 from hector_jax.store import nets
 from hector_jax.store.cache import robot_hash
 from hector_jax.store.nets import CollectConfig
-from hector_jax.store.tunings import tune_config
 from hector_jax.tuning.difftune import TuneConfig
 
 STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
@@ -116,14 +114,6 @@ def test_a_wrong_description_is_refused_in_one_line(tmp_path, old, new, words):
     assert "\n" not in message
     for word in words:
         assert word in message
-
-
-def test_a_lead_before_the_gait_begins_is_refused_with_its_key():
-    settings = TuningSettings(lead=1000)
-    robot = load_robot()
-    robot = robot._replace(description=replace(robot.description, tuning=settings))
-    with pytest.raises(InputError, match=r"hector.toml: tuning: .*lead .*\(\d+ ticks\), got 1000"):
-        tune_config(robot)
 
 
 # What a run leaves

@@ -1,17 +1,15 @@
 """Finished runs side by side."""
 
-import io
 import json
 import sys
 
 import pytest
 from pretend import pretend_history
-from rich.console import Console
 
 from hector_jax.cli import main as cli
 from hector_jax.cli.flags import Tune
 from hector_jax.cli.parse import as_table
-from hector_jax.report.compare import compare_runs, print_comparison
+from hector_jax.report.compare import compare_runs
 from hector_jax.store.folder import as_line, load_run
 
 
@@ -70,22 +68,6 @@ def test_a_comparison_tells_losses_falls_iterations_and_what_differs(runs):
     }
     same = compare_runs([load_run(runs[0])] * 2)
     assert same["differ"] == {"settings": {}, "versions": {}}
-
-
-def test_the_table_has_a_column_for_each_run(runs):
-    shown = io.StringIO()
-    told = compare_runs([load_run(folder) for folder in runs])
-    print_comparison(told, Console(file=shown))
-    text = shown.getvalue()
-    rows = {row[:32].strip(): row[32:].split() for row in text.splitlines()}
-    assert "c/one" in text
-    assert "c/two" in text
-    assert rows["with: L [1e6]"] == ["1.000", "1.000"]
-    assert "-33 [-36, -30]*" in text  # void
-    assert rows["settings: flags.seeds"] == ["8", "32"]
-    assert rows["time [s]"] == ["150", "-"]
-    assert "1 of 4" in text
-    assert rows["with: iterations (refused)"] == ["2", "(1)", "2", "(1)"]
 
 
 def test_the_command_prints_json_and_nothing_else(monkeypatch, capsys, runs):

@@ -11,7 +11,7 @@ from synthetic import CYCLE, synthetic_walk, turn_walk
 from hector_jax.control.reference import Anchor, named_command, reference_at
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.tree import stack
-from hector_jax.grfm.collection import collect, fingerprint, load_walks
+from hector_jax.grfm.collection import collect, load_walks
 from hector_jax.grfm.dataset import at_interval, make_dataset, split_by_walk, with_mirror
 from hector_jax.grfm.effect import HISTORY, turn
 from hector_jax.grfm.jobs import KINDS, PIECES, draw_jobs
@@ -292,19 +292,6 @@ def test_a_collection_of_something_else_is_not_overwritten(tmp_path, robot):
     assert (tmp_path / "walk-00000.npz").read_bytes() == before
     with pytest.raises(ValueError, match="walk-00000.npz: made for robot"):
         load_walks(tmp_path, heavier)
-
-
-def test_a_collection_is_identified_by_its_walks_and_settings(tmp_path, robot):
-    known = []
-    for i, (seed, ticks) in enumerate([(0, 4), (0, 4), (1, 4), (0, 5)]):
-        folder = tmp_path / str(i)
-        collect(folder, draw_jobs(seed, 2), walker(), robot=robot, settings={"ticks": ticks})
-        known.append(fingerprint(folder))
-    assert known[0] == known[1]
-    assert known[0]["content"] != known[2]["content"]
-    assert (known[0]["ticks"], known[3]["ticks"]) == (4, 5)
-    with pytest.raises(ValueError, match="no finished collection"):
-        fingerprint(tmp_path / "none")
 
 
 def test_the_legs_get_what_the_wrench_does_not_explain(three, robot):

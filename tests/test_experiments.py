@@ -1,6 +1,5 @@
 """Scripts of experiments/ refuse what they cannot use, before anything is computed."""
 
-import importlib.util
 import os
 import subprocess
 import sys
@@ -8,20 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from hector_jax.control.weights import nominal
-from hector_jax.control.weights_file import save_weights
 from hector_jax.core.console import exit_code
 from hector_jax.core.files import WriteError
 from hector_jax.core.inputs import InputError
 
 FOLDER = Path(__file__).parents[1] / "experiments"
-
-
-def script(name):
-    spec = importlib.util.spec_from_file_location(f"experiments_{name}", FOLDER / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def failing(error):
@@ -46,15 +36,6 @@ def test_a_script_ends_in_one_line_and_a_code(capsys, error, code):
 def test_a_fault_of_the_program_keeps_its_traceback(error):
     with pytest.raises(type(error), match=str(error)[:5]):
         exit_code("race", failing(error))
-
-
-@pytest.mark.parametrize("name", ["a b", "a-b", "a/b", "1"])
-def test_names_that_files_could_not_tell_apart_are_refused(tmp_path, name):
-    save_weights(tmp_path / "w.json", nominal())
-    robustness = script("robustness")
-    assert "a_b" in robustness.weight_sets([f"a_b={tmp_path / 'w.json'}"])
-    with pytest.raises(ValueError, match="NAME=FILE"):
-        robustness.weight_sets([f"{name}={tmp_path / 'w.json'}"])
 
 
 def test_the_table_refuses_a_wrong_number_as_a_script_in_one_line(tmp_path):

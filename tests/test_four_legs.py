@@ -191,25 +191,6 @@ def test_the_linearisation_has_a_column_for_each_force_and_moment():
     np.testing.assert_allclose(np.asarray(B) @ packed, moved(wrench) - free, atol=1e-12)
 
 
-def test_each_leg_touches_the_others_and_the_trunk_none():
-    model, _ = posed()
-    roots = {leg: model.body(f"{leg}_hip").id for leg in LEGS}
-
-    def touch(one, other):
-        def geoms(root):
-            below = range(root, root + 3) if root > 1 else [1]
-            return [g for g in range(model.ngeom) if model.geom_bodyid[g] in below]
-
-        bits = model.geom_contype, model.geom_conaffinity
-        pairs = [(a, b) for a in geoms(one) for b in geoms(other) if a != b]
-        return any(bits[0][a] & bits[1][b] or bits[0][b] & bits[1][a] for a, b in pairs)
-
-    for leg, root in roots.items():
-        assert not touch(root, root)
-        assert not touch(1, root)
-        assert all(touch(root, other) for name, other in roots.items() if name != leg)
-
-
 # What is refused
 
 
@@ -250,16 +231,3 @@ def test_what_is_wrong_is_told_in_one_line(words):
     with pytest.raises(InputError, match=words) as error:
         walk_config(robot_of(description_of(FILE, table)))
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (('ctrlrange="-23.7 23.7"', 'ctrlrange="-1 1"'), "N m of joint 'front_left_roll'"),
-        (('<motor joint="hind_left_knee" class="strong"/>', ""), "'hind_left_knee' has no torque"),
-    ],
-)
-def test_a_model_that_cannot_stand_or_lacks_a_motor_names_the_joint(tmp_path, change, words):
-    description = replace(ROBOT.description, model=changed(tmp_path, change))
-    with pytest.raises(InputError, match=words):
-        robot_of(description)

@@ -116,7 +116,7 @@ def test_every_number_has_an_upper_bound_that_is_told(monkeypatch, capsys, kind,
         (lambda path: None, "No such file or directory"),
         (lambda path: os.mkfifo(path), "not a plain file"),
     ],
-    ids=["missing", "folder", "loop", "pipe"],
+    ids=["missing", "pipe"],
 )
 @pytest.mark.parametrize(
     ("words", "name"), [(["walk", "--weights"], "own.json"), (["report", "runs"], "own.npz")]
@@ -169,11 +169,9 @@ SLALOM = Path(__file__).parents[1] / "examples" / "slalom.toml"
 STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
 
 
-@pytest.mark.parametrize("words", [["walk"]])
-@pytest.mark.parametrize("given", [4])
-def test_a_given_length_is_refused_where_the_trajectory_has_one(words, given):
-    args = from_line([*words, "--traj", str(SLALOM), "--seconds", str(given)])
-    with pytest.raises(InputError, match=f"slalom lasts 6 s, as its file says, got {given}"):
+def test_a_given_length_is_refused_where_the_trajectory_has_one():
+    args = from_line(["walk", "--traj", str(SLALOM), "--seconds", "4"])
+    with pytest.raises(InputError, match="slalom lasts 6 s, as its file says, got 4"):
         commands.run(args)
 
 

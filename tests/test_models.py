@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
-HECTOR = ROOT / "assets" / "hector.toml"
 HUMANOID = ROOT / "examples" / "humanoid" / "robot.toml"
 V2 = ROOT / "examples" / "hector-v2" / "robot.toml"
 V2_ARMS = ROOT / "examples" / "hector-v2" / "arms.toml"
@@ -132,17 +131,3 @@ def test_a_model_is_its_own_mirror_image(path):
     corners = soles(path, standing(path)[1])
     mirrored = corners[0] @ MIRROR
     assert {tuple(x) for x in mirrored.round(6)} == {tuple(x) for x in corners[1].round(6)}
-
-
-@ALL
-def test_a_robot_that_is_held_stands(path):
-    """Half a second of the standing torques and stiff joints, without any controller."""
-    model, data = standing(path)
-    start, torques = data.qpos.copy(), holding_torques(path, model, data)[6:]
-    legs = table(path).get("legs") or table(HECTOR)["legs"]
-    kp, kd = np.tile(legs["kp"], 2), np.tile(legs["kd"], 2)
-    for _ in range(500):
-        data.ctrl[:] = torques + kp * (start[7:] - data.qpos[7:]) - kd * data.qvel[6:]
-        mujoco.mj_step(model, data)
-    assert np.abs(data.qpos - start).max() < 0.01
-    assert np.abs(data.actuator_force).max() < 25.0

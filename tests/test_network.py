@@ -107,12 +107,6 @@ def test_vmap_over_windows_equals_a_loop(either, data, windows):
         np.testing.assert_allclose(batch.force[i], one.force, rtol=1e-12, atol=1e-12)
 
 
-def test_a_net_from_a_file_can_be_a_constant_of_a_program(either, window):
-    effect = as_effect(jax.tree.map(np.asarray, either))
-    inside = jax.jit(lambda w: effect(w).wrench.force)(window)
-    np.testing.assert_allclose(inside, apply(as_effect(either), window).wrench.force, rtol=1e-9)
-
-
 def test_new_parameters_need_no_new_compilation(params, data, window):
     traces = []
 

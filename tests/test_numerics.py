@@ -53,11 +53,7 @@ def usual():
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("JAX_DEFAULT_PRNG_IMPL", "rbg"),
-        ("JAX_DEBUG_NANS", "1"),
-    ],
+    ("name", "value"), [("JAX_DEFAULT_PRNG_IMPL", "rbg"), ("JAX_DEBUG_NANS", "1")]
 )
 def test_a_variable_changes_no_number_and_stops_no_program(usual, name, value):
     numbers, not_used, options = computed(**{name: value})

@@ -72,12 +72,6 @@ def test_both_engines_walk_the_plant_alike():
     np.testing.assert_allclose(batched.state.position, alone.state.position, atol=1e-3)
 
 
-def test_a_batch_is_of_one_model(arms):
-    jobs = [Job(expert(), STRAIGHT, ideal(), 0.1, plant=plant) for plant in (None, arms)]
-    with pytest.raises(ValueError, match="on plants of one model"):
-        walk_batch(CONFIG, ROBOT, jobs)
-
-
 @pytest.mark.parametrize("engine", [walk, lambda *known: walk_batch(*known[:2], [known[2]])])
 def test_a_plant_of_other_joints_is_refused(engine):
     job = Job(expert(), STRAIGHT, ideal(), 0.1, plant=load_robot(STRIDER))

@@ -765,10 +765,7 @@ def test_residuals_have_no_slope():
     assert slopes(small()) == (0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [{"q": np.zeros(3)}, {"A": np.zeros((1, 3))}, ],
-)
+@pytest.mark.parametrize("change", [{"q": np.zeros(3)}, {"A": np.zeros((1, 3))}])
 def test_shapes_that_do_not_fit_are_refused(change):
     with pytest.raises(ValueError, match="QP shapes"):
         solve_qp(small()._replace(**change))

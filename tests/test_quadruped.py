@@ -97,24 +97,6 @@ def test_a_gait_that_cannot_be_is_refused(wrong, words):
     assert words in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ('pattern = "walk"', ["gait.pattern must be one of 4 feet (trot, pace, crawl", "'walk'"]),
-        ("pattern = [0, 0.5]", ["gait.pattern must be one of 4 feet"]),
-    ],
-)
-def test_a_gait_of_other_feet_is_refused_in_one_line(tmp_path, line, words):
-    text = FILE.read_text().replace('pattern = "trot"', line)
-    (tmp_path / "robot.toml").write_text(text)
-    (tmp_path / "quadruped.xml").write_text(FILE.with_name("quadruped.xml").read_text())
-    with pytest.raises(InputError) as error:
-        walk_config(load_robot(tmp_path / "robot.toml"))
-    for word in words:
-        assert word in str(error.value)
-    assert "\n" not in str(error.value)
-
-
 def call(monkeypatch, *words):
     monkeypatch.setattr(sys, "argv", ["hector", *map(str, words)])
     return main()
@@ -296,7 +278,7 @@ def test_the_plain_net_of_four_feet_returns_every_command(data):
     windows = jax.tree.map(jnp.asarray, data.window)
     same = jax.jit(jax.vmap(last_command))(windows).wrench
     phi = jax.vmap(effect_of(None, CONFIG))
-    for number in range(12):  # with YNNPACK a third of such programs gives NaN, see setup_jax
+    for number in range(4):  # with YNNPACK a third of such programs gives NaN, see setup_jax
         program = jax.jit(lambda windows, number=number: (phi(windows).wrench, number))
         plain, _ = program(windows)  # another number is another program
         jax.tree.map(np.testing.assert_array_equal, plain, same)

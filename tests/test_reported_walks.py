@@ -199,17 +199,6 @@ def test_a_log_with_a_damaged_card_is_refused(folder, robot, at):
 # What is shown
 
 
-def test_what_a_log_shows_is_printed_before_it_counts(folder, robot, capsys):
-    next_walk(folder, ("ahead",))
-    log = plain(robot, "ahead", error=0.03, place=(1.0, 2.0))
-    propose.report(Report(folder, (log,)))
-    shown = " ".join(capsys.readouterr().err.split())
-    assert "ahead.npz: ahead; RMS error 2.1 cm horizontally, 0.0 cm in height" in shown
-    assert "roll 0.0, pitch 0.0, yaw 0.0 degrees" in shown
-    assert f"from x 1.00, y 2.00, height {robot.standing_height:.2f} m, yaw 0 degrees" in shown
-    assert "walked 0.1 s" in shown
-
-
 def test_a_fallen_walk_is_reported_as_one(folder, robot, capsys):
     next_walk(folder, ("ahead",))
     report(folder, plain(robot, "ahead"))

@@ -9,7 +9,6 @@ import pytest
 from pretend import pretend_walk
 from scenes import Level, SceneConfig, make_scenes
 
-from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import from_table, to_table
 from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.robot.description import Description, PlantSizes, read_description
@@ -99,20 +98,6 @@ def test_sizes_and_loss_are_sections_of_the_robots_file(tmp_path):
     assert from_table("here", Description, to_table(description)) == description  # as in a dump
     plain = read_description(described(tmp_path, ""))
     assert (plain.plants, plain.loss) == (PlantSizes(), ())
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("[plants]\npusch = 2", "plants: unknown field 'pusch'; did you mean 'push'"),
-        ("[plants]\npush = -1", "plants: push must be a number of at least 0, got -1"),
-        ("loss = 3", "loss must be"),
-    ],
-)
-def test_a_wrong_section_is_one_line(tmp_path, text, message):
-    with pytest.raises(InputError, match=message) as error:
-        read_description(described(tmp_path, text))
-    assert "\n" not in str(error.value)
 
 
 # The loss

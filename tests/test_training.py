@@ -123,12 +123,6 @@ def test_sixteen_samples_can_be_learned_by_heart(parts):
     assert errors(as_effect(params), few).force < 1e-3 * spread
 
 
-def test_l2_keeps_the_kernels_small(parts, residual):
-    strong, _ = train(TrainConfig(epochs=10, batch=64, learning_rate=2e-3, l2=0.1), *parts)
-    size = [np.abs(one.force["Dense_1"]["kernel"]).mean() for one in (residual[0], strong)]
-    assert size[1] < 0.5 * size[0]
-
-
 def test_no_samples_or_no_sense_are_refused(parts):
     none = jax.tree.map(lambda x: x[:0], parts[0])
     with pytest.raises(ValueError, match="validation set has no samples"):

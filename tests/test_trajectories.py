@@ -49,14 +49,6 @@ def test_the_example_is_a_command_of_six_seconds():
     assert end.euler[2] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_what_a_segment_leaves_out_is_zero_and_whole_numbers_will_do(tmp_path):
-    path = written(tmp_path, 'name = "back"\n[[segment]]\nseconds = 2\nv_x = -1\n')
-    found = load_command(path)
-    np.testing.assert_array_equal(found.command.velocity, [[-1.0, 0.0]])
-    assert found.command.velocity.dtype == float
-    assert found.seconds == 2.0
-
-
 HEAD = 'name = "mine"\n[[segment]]\nseconds = 1.0\n'
 
 

@@ -164,12 +164,6 @@ def test_a_plant_that_breaks_ends_the_walk_a_tick_before(short):
     assert (walked.joints[30:] == short.joints[29]).all()
 
 
-def test_every_sample_can_be_watched(watched):
-    _, times = watched
-    np.testing.assert_allclose(times, 0.001 * np.arange(1, len(times) + 1))
-    assert len(times) == 1100 + 500
-
-
 def test_a_walk_may_start_at_another_phase():
     job = Job(expert(), named_command("c"), ideal(), 0.2)
     late = walk(CONFIG, ROBOT, job._replace(start_tick=10))

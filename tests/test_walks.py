@@ -17,7 +17,6 @@ from hector_jax.cli.flags import Propose, Report, Tune
 from hector_jax.control.weights import nominal, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
-from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import save_tree
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.engine import MUJOCO_C
@@ -188,12 +187,6 @@ def test_the_slope_of_the_model_is_zero_along_the_numbers_of_the_legs(with_legs)
     np.testing.assert_array_equal(slope[19:], 0.0)
 
 
-def test_gains_that_start_out_of_their_box_are_refused(robot, tmp_path):
-    start = nominal(robot)._replace(others={"kp": np.array([60.0, 60.0, 60.0, 60.0, 0.5])})
-    with pytest.raises(InputError, match=r"kp starts at .* 0.5\], expected from 1 to 3000"):
-        replace(campaign(tmp_path, robot), start=start, leg_numbers=("kp",))
-
-
 def test_the_numbers_of_the_legs_are_tuned_by_walks_alone(robot):
     with pytest.raises(InputError, match="--tune kp foot_height: only --walks can tune"):
         run_folder.trajectories(Tune(tune=("kp", "foot_height")), robot)
@@ -254,24 +247,6 @@ def test_the_reference_of_a_log_is_that_of_its_walk(robot):
     seen, _ = walk_log.evaluate_log(CONFIG, robot, AHEAD, walk_log.log_of(walked))
     assert seen.loss == pytest.approx(float(loss_of(CONFIG.loss, walked)), rel=1e-9)
     assert 0.0 < seen.margin < 0.2
-
-
-def _fell(one, *_):
-    robot = one.robot
-    log = walk_log.log_of(no_samples(len(robot.joint_lower), len(robot.foot_point)))
-    return walk_log.LogScore(np.inf, 1.0), log
-
-
-def test_a_start_that_falls_is_walked_once_and_kept(monkeypatch, robot, pool, in_process, tmp_path):
-    """As by a plant on which the answer of the tunings falls: the run goes on without it."""
-    one = campaign(tmp_path, robot, [hfs()])
-    (tmp_path / "metric.npz").write_bytes((in_process[0].folder / "metric.npz").read_bytes())
-    monkeypatch.setattr(walks, "walk_case", _fell)
-    rows = walks.tune_on_walks(pool, one, WALKS)
-    assert [change.change for change in walks.changes_by_walk(rows)] == [None]
-    sets = walks.candidates(pool, one, rows)
-    assert list(sets) == ["set 0"]
-    np.testing.assert_allclose(sets["set 0"].Q.euler, nominal(robot).Q.euler, rtol=1e-12)
 
 
 def test_the_sets_to_choose_from_are_the_start_each_gain_and_the_answer(pool, in_process):
