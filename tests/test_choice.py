@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 from model import CONFIG, ROBOT
-from pretend import tuning_of
+from pretend import instead, tuning_of
 
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import nominal
@@ -58,7 +58,7 @@ def _walk(monkeypatch, median):
             }
         )
 
-    monkeypatch.setattr(judging, "judge", judge)
+    instead(monkeypatch, judging, "judge", judge)
 
 
 STRAIGHT = named_command("straight")

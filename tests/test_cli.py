@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import table
 from model import BEST_OTHERS
+from pretend import instead
 from synthetic import synthetic_walk
 
 from hector_jax.cli import arguments, doctor, evaluate
@@ -68,7 +69,7 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
     fallen = np.arange(len(walk.fallen)) >= 20 * len(walk.fallen) // 30
     residual = np.where(fallen, np.inf, 0.0)
     wrong = walk._replace(fallen=fallen, residual=residual)
-    monkeypatch.setattr(arguments, "walk_once", lambda *args, **kwargs: wrong)
+    instead(monkeypatch, arguments, "walk_once", lambda *args, **kwargs: wrong)
     assert call(monkeypatch, "walk") == 1
     out, err = capsys.readouterr()
     assert "nominal weights: ended after 0.20 s" in out
@@ -77,10 +78,10 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
     found = json.loads(capsys.readouterr().out)
     assert (found["fell"], found["plans"], found["unsolved"]) == (False, 30, 10)
     assert found["residual"] is None
-    monkeypatch.setattr(
-        arguments, "walk_once", lambda *args, **kwargs: walk._replace(fallen=fallen)
+    instead(
+        monkeypatch, arguments, "walk_once", lambda *args, **kwargs: walk._replace(fallen=fallen)
     )
-    monkeypatch.setattr(evaluate, "fall_of", lambda *args: None)  # it does not fall again
+    instead(monkeypatch, evaluate, "fall_of", lambda *args: None)  # it does not fall again
     assert call(monkeypatch, "walk") == 0
     assert "nominal weights: fell after 0.20 s" in capsys.readouterr().out
 
@@ -332,15 +333,15 @@ def test_the_doctor_names_an_engine_that_cannot_be_loaded(monkeypatch):
     def choose(name):
         raise InputError(f"{name} is of another Python")
 
-    monkeypatch.setattr(doctor, "choose_engine", choose)
+    instead(monkeypatch, doctor, "choose_engine", choose)
     monkeypatch.setattr(doctor, "load_robot", lambda: json.loads("no robot"))  # nor a walk
     assert {"c is of another Python", "mjx is of another Python"} < set(doctor.examine()[1])
 
 
 def test_a_sound_machine_passes_the_doctor(monkeypatch, capsys):
     walks = {"srbm": synthetic_walk(0, 30), "ideal": synthetic_walk(0, 30)}
-    monkeypatch.setattr(doctor, "_walks", lambda robot: walks)
-    monkeypatch.setattr(doctor, "write_film", lambda *args: "egl")
+    instead(monkeypatch, doctor, "_walks", lambda robot: walks)
+    instead(monkeypatch, doctor, "write_film", lambda *args: "egl")
     assert call(monkeypatch, "doctor", "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert told["faults"] == []

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from pretend import pretend_walk
+from pretend import instead, pretend_walk
 
 from hector_jax.cli import arguments, evaluate
 from hector_jax.cli import tune as tuning
@@ -170,8 +170,8 @@ def test_a_start_that_falls_is_refused_before_anything_is_collected(monkeypatch,
         made.extend(jobs)
         yield from (pretend_walk(fall_at=0.5 if job.command is S else None) for job in jobs)
 
-    monkeypatch.setattr(judging, "walk_jobs", walks_of)
-    monkeypatch.setattr(tuning, "fall_of", lambda *args: FALL)
+    instead(monkeypatch, judging, "walk_jobs", walks_of)
+    instead(monkeypatch, tuning, "fall_of", lambda *args: FALL)
     both = [NamedCommand(name, named_command(name)) for name in ("straight", "s")]
     S = both[1].command
     with ThreadPoolExecutor(1) as pool:
@@ -192,8 +192,8 @@ def test_a_start_that_falls_is_refused_before_anything_is_collected(monkeypatch,
 
 
 def test_hector_walk_tells_the_fall_and_prints_no_nan(monkeypatch, capsys):
-    monkeypatch.setattr(arguments, "walk_once", lambda *args, **kwargs: fallen_at_once())
-    monkeypatch.setattr(evaluate, "fall_of", lambda *args: FALL)
+    instead(monkeypatch, arguments, "walk_once", lambda *args, **kwargs: fallen_at_once())
+    instead(monkeypatch, evaluate, "fall_of", lambda *args: FALL)
     monkeypatch.setattr(sys, "argv", ["hector", "walk"])
     assert main() == 0
     out = capsys.readouterr().out

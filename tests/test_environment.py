@@ -1,6 +1,5 @@
 """Whatever the environment is, a program works, or one line says what of it is wrong."""
 
-import json
 import os
 import signal
 import subprocess
@@ -35,16 +34,6 @@ def test_what_jax_cannot_start_with_is_one_line(wrong, line):
     said = [text for text in done.stderr.splitlines() if text != "loading JAX and MuJoCo"]
     assert len(said) == 1
     assert said[0].startswith(f"hector: {line}")
-
-
-def test_the_doctor_names_what_jax_cannot_start_with():
-    wrong, line = WRONG[-1]
-    done = hector("doctor", "--json", env=USUAL | wrong)
-    assert done.returncode == 1
-    (fault,) = json.loads(done.stdout)["faults"]
-    assert fault.startswith(line)
-    assert f"hector: {line}" in done.stderr
-    assert "Traceback" not in done.stderr
 
 
 def test_a_renderer_is_needed_for_a_film_alone(tmp_path):

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from published import urdf_of
 
 from hector_jax.cli.main import main
 from hector_jax.control.controller import walk_config
@@ -71,14 +70,6 @@ def test_legs_are_found_in_any_order_and_by_any_name(tmp_path):
     names = [[found.model.joint(j).name for j in leg] for leg in found.legs]
     assert names == [joints_of(f"part{i}") for i in range(4)]
     assert propose_robot(path).wrong == ()
-
-
-def test_a_urdf_with_four_legs_is_proposed(tmp_path):
-    path = tmp_path / "quadruped.urdf"
-    path.write_text(urdf_of(compile_model(ROBOT.description)))
-    found = survey_file(path)
-    names = [found.model.joint(j).name for leg in found.legs for j in leg]
-    assert names == list(ROBOT.description.joints)
 
 
 def test_motors_without_armature_get_one_by_their_torque(tmp_path):

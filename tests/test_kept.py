@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 import pytest
-from pretend import pretend_history, pretend_walk, tuning_of
+from pretend import instead, pretend_history, pretend_walk, tuning_of
 
 from hector_jax.control.parameters import bounds
 from hector_jax.control.reference import named_command
@@ -40,7 +40,7 @@ def tuned(monkeypatch):
                 on_iteration(name, iteration)
             yield name, Tuned(TUNING, setup.commit)
 
-    monkeypatch.setattr(tunings, "_tunings", side_by_side)
+    instead(monkeypatch, tunings, "_tunings", side_by_side)
     return names
 
 
@@ -58,7 +58,7 @@ def walked(monkeypatch):
             yield pretend_walk(job.seed, float(job.weights.Q.euler[0]) / 1e4, 1.0, fall_at=fall_at)
 
     walks_of.cut = None
-    monkeypatch.setattr(judging, "walk_jobs", walks_of)
+    instead(monkeypatch, judging, "walk_jobs", walks_of)
     return seeds, walks_of
 
 
@@ -164,7 +164,7 @@ def test_a_walk_with_an_unsolved_qp_is_said(tmp_path, monkeypatch, capsys, resid
             walk = pretend_walk(job.seed, 0.03, 1.0)
             yield walk._replace(residual=np.where(job.seed == 1, residual, walk.residual))
 
-    monkeypatch.setattr(judging, "walk_jobs", walks_of)
+    instead(monkeypatch, judging, "walk_jobs", walks_of)
     for _ in range(2):  # as walked, and as kept
         judge(tmp_path, {"mine": nominal()})
         said = " ".join(capsys.readouterr().err.split())

@@ -12,6 +12,7 @@ import numpy as np
 import optax
 import pytest
 from model import CONFIG, ROBOT
+from pretend import instead
 
 from hector_jax.control.contact import InputConstraint, Rows
 from hector_jax.control.mpc import MpcConfig
@@ -239,7 +240,7 @@ def test_equality_of_parts_is_an_equivalence():
 
 def search(folder, engine, monkeypatch):
     losses = lambda setup, sets, **_: {name: np.arange(4.0) for name in sets}  # noqa: E731
-    monkeypatch.setattr(searches, "losses_on_hfs", losses)
+    instead(monkeypatch, searches, "losses_on_hfs", losses)
     config = SearchConfig(budget=4, population=4)
     commands = {"s": named_command("s")}
     setup = Setup(Executor(), CONFIG, ROBOT)

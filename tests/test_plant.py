@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pretend import pretend_walk
+from pretend import instead, pretend_walk
 
 from hector_jax.cli import arguments
 from hector_jax.cli.main import main
@@ -83,8 +83,11 @@ def test_a_plant_of_other_joints_is_refused(engine):
 
 
 def test_scores_of_another_plant_are_others(monkeypatch, tmp_path, arms):
-    monkeypatch.setattr(
-        judging, "walk_jobs", lambda *known: (pretend_walk(job.seed) for job in known[1])
+    instead(
+        monkeypatch,
+        judging,
+        "walk_jobs",
+        lambda *known: (pretend_walk(job.seed) for job in known[1]),
     )
     known = {"nominal": nominal()}, STRAIGHT, [hfs()], [0]
     # another file with the very same numbers

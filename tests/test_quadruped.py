@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import jsonschema
 import numpy as np
 import pytest
-from pretend import pretend_walk
+from pretend import instead, pretend_walk
 from test_humanoid import check_engines, check_export, check_gradients
 
 from hector_jax.cli.arguments import with_gait
@@ -107,7 +107,7 @@ def test_a_gait_is_chosen_by_name(monkeypatch, capsys):
     walked = []
     with monkeypatch.context() as patch:
         pretend = lambda robot, *known: walked.append(walk_config(robot)) or pretend_walk()  # noqa: E731
-        patch.setattr(judging, "walk_rigid_body", pretend)
+        instead(patch, judging, "walk_rigid_body", pretend)
         for name in ("own", "trot", "pace", "crawl"):
             assert call(monkeypatch, "walk", *flags, "--gait", name) == 0
     named = [gait_named(CONFIG.gait, name) for name in ("trot", "pace", "crawl")]

@@ -12,6 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from pretend import instead
 from test_walks import HandsOver
 
 from hector_jax.cli import evaluate, propose
@@ -56,9 +57,9 @@ def folder(monkeypatch, robot, tmp_path):
     """A folder for reports of three trajectories, in which nothing is computed for a proposal."""
     pool = HandsOver()
     monkeypatch.setattr(propose, "workers", lambda processes: nullcontext(pool))
-    monkeypatch.setattr(walks.few_walks, "propose", proposed)
-    monkeypatch.setattr(walks.few_walks, "needs_model", lambda *_: False)
-    monkeypatch.setattr(walks.few_walks, "incumbent", lambda _, h: walks.few_walks.best_walk(h))
+    instead(monkeypatch, walks.few_walks, "propose", proposed)
+    instead(monkeypatch, walks.few_walks, "needs_model", lambda *_: False)
+    instead(monkeypatch, walks.few_walks, "incumbent", lambda _, h: walks.few_walks.best_walk(h))
     monkeypatch.setattr(propose.arguments, "beyond", lambda *_: "")  # takes a quarter of a second
     monkeypatch.setattr(propose.arguments, "limits", lambda *_: None)
     monkeypatch.chdir(tmp_path)
@@ -323,7 +324,7 @@ def test_reports_are_scored_by_the_present_loss(walked, monkeypatch):
     def heavier(description):
         return loss_of_robot(replace(description, loss=(("L_pos", 1e9),)))
 
-    monkeypatch.setattr(propose.tunings, "loss_of_robot", heavier)
+    instead(monkeypatch, propose.tunings, "loss_of_robot", heavier)
     after, one = rows(walked), campaign(walked)
     for number, (old, new) in enumerate(zip(before, after, strict=True)):
         scores = walks.evaluate_logs(HandsOver(), one, number)

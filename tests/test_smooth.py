@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 from model import BEST_OTHERS, CONFIG, ROBOT
-from pretend import pretend_tuning
+from pretend import instead, pretend_tuning
 
 from hector_jax.cli import run_folder
 from hector_jax.cli import tune as command
@@ -31,7 +31,7 @@ def _tunings(monkeypatch, folder, flags, robot=ROBOT, config=CONFIG):
         seen.update({name: (setup.config, start, problem) for name, problem in problems.items()})
         return dict.fromkeys(problems, Tuned(pretend_tuning(3, start), ""))
 
-    monkeypatch.setattr(tunings, "tune_all", tune)
+    instead(monkeypatch, tunings, "tune_all", tune)
     setup, course = Setup(Executor(), config, robot), (command_of("straight"),)
     run = command._Run(setup, folder, flags, nominal(), course, SimpleNamespace(params=None))
     command._tune_sets(run)

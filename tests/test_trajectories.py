@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pretend import instead
 
 from hector_jax.cli import arguments
 from hector_jax.cli.main import main
@@ -132,7 +133,7 @@ def walked(monkeypatch):
         walks.append((job.command, job.seconds))
         raise InputError("walked")
 
-    monkeypatch.setattr(sim_walk, "walk", pretend)
+    instead(monkeypatch, sim_walk, "walk", pretend)
     return walks
 
 

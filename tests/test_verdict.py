@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pretend import pretend_score, pretend_walk
+from pretend import instead, pretend_score, pretend_walk
 
 from hector_jax.cli import verdict as command
 from hector_jax.cli.main import main
@@ -179,8 +179,9 @@ def walked(monkeypatch):
             yield pretend_walk(job.seed, float(job.weights.Q.euler[0]) / 1e4, 1.0)
 
     other = MUJOCO_C._replace(name="drake", title="Drake")
-    monkeypatch.setattr(judging, "walk_jobs", walks_of)
-    monkeypatch.setattr(
+    instead(monkeypatch, judging, "walk_jobs", walks_of)
+    instead(
+        monkeypatch,
         command,
         "choose_engine",
         lambda name: {"c": MUJOCO_C, "drake": other}.get(name) or missing(),
@@ -271,15 +272,6 @@ def test_wrong_input_is_one_line_before_anything_is_walked(
     assert fault in lines[0]
     assert walked.jobs == []
     assert not (tmp_path / "out").exists()
-
-
-def test_walks_of_models_and_trajectories_with_hyphens_are_told_apart():
-    walks = {name: (NamedCommand(name, named_command("s")), 1.0) for name in ("y-z", "z")}
-    sets = {name: {"nominal": nominal()} for name in walks}
-    models = {"x": command.Model(), "x-y": command.Model(mass=1.1)}
-    columns = {Column("c", model): range(1) for model in models}
-    plan = command.Plan(load_robot(), "standin", walks, sets, models, columns, {"c": MUJOCO_C})
-    assert len(command._jobs(plan, "c")) == 4
 
 
 def small(folder):

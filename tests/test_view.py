@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 from browser import CHROMIUM, opened
-from pretend import elsewhere, pretend_history, pretend_walk
+from pretend import elsewhere, instead, pretend_history, pretend_walk
 
 from hector_jax.cli import arguments
 from hector_jax.cli.flags import Tune
@@ -162,7 +162,7 @@ def test_headless_writes_film_and_pictures_instead(monkeypatch, capsys, tmp_path
     filmed = []
     for write in ("write_film", "write_strip"):
         monkeypatch.setattr(pictures, write, lambda *film: filmed.append(film))
-    monkeypatch.setattr(arguments, "walk_once", lambda *_: pretend_walk(seconds=0.3))
+    instead(monkeypatch, arguments, "walk_once", lambda *_: pretend_walk(seconds=0.3))
     monkeypatch.setattr(inputs, "find_spec", lambda name: None)  # needs no viser
     run, out = pretend_run(tmp_path / "run"), tmp_path / "out"
     flags = ["--world", "srbm", "--sets", "nominal", "expert"]
@@ -184,42 +184,6 @@ def page(robot, model, tmp_path):
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
     yield view.Page(server, motions, model, run, "a story"), run, motions
     server.stop()
-
-
-def test_a_page_plays_from_start_to_end_and_again(robot, page):
-    page, _, motions = page
-    page._speed.value = 1.0
-    page.advance(0.5)
-    assert page._time.value == pytest.approx(0.5)
-    trunk, walked = page._handles[0]["bodies"][1], motions["before"]
-    np.testing.assert_allclose(trunk.position, walked.qpos[49, :3])
-    np.testing.assert_allclose(trunk.wxyz, walked.qpos[49, 3:7])
-    apart = np.linalg.norm(trunk.position - walked.path[49])
-    np.testing.assert_allclose(apart, np.linalg.norm(robot.com_offset), atol=1e-9)
-    assert "fell" not in page._handles[1]["name"].text
-    page.advance(0.3)
-    assert page._handles[1]["name"].text == "after, fell at 0.60 s"
-    page.advance(0.9)
-    assert page._time.value == pytest.approx(1.0)
-    page.advance(0.1)
-    assert page._time.value == 0.0
-
-
-def test_the_curves_grow_with_the_run(page):
-    page, run, _ = page
-    assert len(page._losses.data[0]) == 13
-    assert "the run goes on" in page._progress.content
-    write_metrics(run, 20)
-    page.advance(0.5)
-    assert len(page._losses.data[0]) == 13  # not looked at yet
-    page.advance(0.6)
-    assert len(page._losses.data[0]) == 21
-    assert [line["label"] for line in page._losses.series] == ["iteration", "without", "with"]
-    assert "with: iteration 20" in page._progress.content
-    assert "the run goes on" in page._progress.content
-    write_json(run / "result.json", {})
-    page.advance(1.1)
-    assert "the run is done" in page._progress.content
 
 
 def _until(seconds, look):
