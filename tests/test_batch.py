@@ -119,6 +119,23 @@ def test_each_tuning_of_a_batch_is_that_of_a_single_one(on_toy, config):
     assert found.history.iteration.shape[1] <= config.iterations + 1
 
 
+def test_a_batch_tunes_other_numbers_as_a_single_tuning_does(monkeypatch):
+    def leaning(config, scenario, weights, loss, *, walk=None):
+        """The bowl, and another in the lead of turns, about 1.2."""
+        found, lead = toy(config, scenario, weights, loss), weights.others["turn_lead"]
+        gradient = found.gradient._replace(others={"turn_lead": 2e6 * (lead - 1.2)})
+        return found._replace(loss=found.loss + 1e6 * (lead - 1.2) ** 2, gradient=gradient)
+
+    use(monkeypatch, leaning)
+    config = replace(TOY, others=("turn_lead",))
+    asked = stack([problem(start, [scenario("c")]) for start in STARTS[:2]])
+    found = tune_batch(config, ROBOT, asked, last_command)
+    for i, start in enumerate(STARTS[:2]):
+        alone = tune(config, alone_on("c"), start)
+        assert abs(alone.weights.others["turn_lead"] - 1.2) < 0.2
+        close(jax.tree.map(lambda x, i=i: x[i], found.weights), alone.weights, rtol=1e-9)
+
+
 def test_how_many_walk_side_by_side_does_not_matter(on_toy):
     asked = stack([problem(w, [scenario("c")]) for w in STARTS])
     one, *others = (tune_batch(TOY, ROBOT, asked, last_command, lanes=lanes) for lanes in (1, 2, 0))

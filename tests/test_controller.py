@@ -18,7 +18,7 @@ from hector_jax.control.controller import (
     step_plan,
 )
 from hector_jax.control.gait import GaitConfig
-from hector_jax.control.legs import Measurement, stance_torques
+from hector_jax.control.legs import Measurement, stance_torques, trunk_position
 from hector_jax.control.mpc import Horizon, MpcConfig, limit_distance
 from hector_jax.control.parameters import TUNABLES, Q
 from hector_jax.control.reference import Anchor, named_command
@@ -27,6 +27,7 @@ from hector_jax.core.geometry import rot_z
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State
 from hector_jax.qp import Status
+from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.difftune import TuneConfig
 
@@ -101,6 +102,16 @@ def test_a_turned_hip_turns_its_foot():
     joints = measurement.joints.at[5].add(0.3)
     feet = feet_of(measurement._replace(joints=joints))
     np.testing.assert_allclose(feet.yaw, [1.0, 1.3], atol=1e-9)
+
+
+def test_a_tilted_robot_has_its_feet_where_kinematics_puts_them():
+    state = standing().state._replace(euler=jnp.array([0.1, -0.2, 0.3]))
+    measurement = standing()._replace(state=state)
+    local, trunk = jax.jit(
+        lambda now: (foot_poses(ROBOT, now.joints).position, trunk_position(ROBOT, now.state))
+    )(measurement)
+    below = feet_of(measurement).position - trunk
+    np.testing.assert_allclose(np.linalg.norm(below, axis=1), np.linalg.norm(local, axis=1))
 
 
 # What it remembers

@@ -114,22 +114,15 @@ def test_a_fall_in_the_start_up_is_that_of_the_walk():
     assert diagnosis.fall_of(config, ROBOT, JOB._replace(seconds=0.05)) is None
 
 
-@pytest.mark.parametrize(
-    ("plant", "cause"),
-    [
-        (hfs()._replace(floor_friction=np.array(0.22)), "foot slips"),
-        (hfs()._replace(torque_gain=np.full(10, 0.3)), "sinks steadily"),
-    ],
-)
-def test_a_fall_of_a_walk_has_the_cause_of_its_plant(plant, cause):
-    s, config = named_command("s"), WalkConfig()
-    job = JOB._replace(command=s, imperfections=plant, seconds=2.0)
+def test_a_fall_of_a_walk_has_the_cause_of_its_plant():
+    icy, config = hfs()._replace(floor_friction=np.array(0.22)), WalkConfig()
+    job = JOB._replace(command=named_command("s"), imperfections=icy, seconds=2.0)
     walked = walk(config, ROBOT, job)
     fall = diagnosis.fall_of(config, ROBOT, job)
     assert fall is not None
     assert fall.time > 0.0
     assert fall.time == pytest.approx(0.001 * np.sum(~walked.fallen))
-    assert cause in fall.cause
+    assert "foot slips" in fall.cause
     assert str(fall).startswith(f"fell after {fall.time:.2f} s: ")
 
 

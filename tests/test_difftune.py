@@ -89,6 +89,13 @@ def test_the_relative_step_is_theta_less_beta_theta_g_over_the_largest_g_of_its_
         np.testing.assert_allclose(vector(moved), expected, rtol=1e-12)
 
 
+def test_the_literal_step_is_theta_less_beta_times_the_gradient():
+    gradient = random_tree(5, 1e-4)
+    moved = stepped_once(gradient, TuneConfig(rule="literal"))
+    expected = vector(nominal()) - np.repeat([0.05, 0.08], 12) * vector(mean_over_feet(gradient))
+    np.testing.assert_allclose(vector(moved), np.clip(expected, *map(vector, bounds())), rtol=1e-12)
+
+
 @pytest.mark.parametrize("rule", ["gauss_newton", "relative", "literal"])
 @pytest.mark.parametrize("side", [0, 1])
 def test_a_step_out_of_the_box_ends_exactly_on_its_wall(side, rule):

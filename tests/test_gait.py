@@ -55,6 +55,11 @@ def test_swing_clock_runs_through_the_swing():
     )
 
 
+def test_time_since_switch_restarts_at_every_switch():
+    since = np.asarray(gait.since_switch(CONFIG, jnp.arange(0, 60)))
+    np.testing.assert_allclose(since, 0.01 * (np.arange(60) % 20))
+
+
 @pytest.mark.parametrize("wrong", [{"tick": 0.0}, {"swing": -1}, {"stance": 10}, {"stance": 21}])
 def test_impossible_gaits_are_refused(wrong):
     with pytest.raises(ValueError, match="GaitConfig"):

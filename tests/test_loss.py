@@ -18,7 +18,7 @@ from hector_jax.report.report import render
 from hector_jax.robot.model import load_robot
 from hector_jax.store.folder import as_line
 from hector_jax.tuning.difftune import TuneConfig, tune
-from hector_jax.tuning.loss import PAPER_LOSS, LossTerm, losses, switch_loss, total
+from hector_jax.tuning.loss import PAPER_LOSS, LossTerm, losses, switch_loss, total, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig, Scenario
 from hector_jax.verdict import metrics
 
@@ -145,6 +145,12 @@ def test_switch_loss_is_the_share_at_changes_of_stance():
     )
     assert switches_of(trajectory) == pytest.approx(60.0**2)
     assert parts_of(trajectory)["L_ctrl"] == pytest.approx(60.0**2 + 25.0)
+
+
+def test_the_total_is_weighted_by_the_alphas():
+    parts = parts_of(off_by(walk(), 0.1, 0.2)) | {"L_ctrl": jnp.array(7.0)}
+    expected = 3.0 * parts["L_Eul"] + 5.0 * parts["L_pos"] + 7.0
+    assert total(with_alphas({"L_Eul": 3.0, "L_pos": 5.0}), parts) == pytest.approx(expected)
 
 
 def sway_loss(trajectory):

@@ -302,6 +302,7 @@ def test_the_controller_of_the_quadruped_is_exported():
     check_export(ROBOT)
 
 
+@pytest.mark.slow
 def test_the_quadruped_stands_on_all_feet():
     robot = with_gait(ROBOT, "stand")
     still = jax.tree.map(np.zeros_like, named_command("straight"))._replace(duration=np.ones(2))

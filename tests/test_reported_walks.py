@@ -197,6 +197,17 @@ def test_a_log_with_a_damaged_card_is_refused(folder, robot, at):
     refused(folder, "^ahead.npz: ", str(log))
 
 
+def test_what_a_campaign_cannot_do_now_is_one_line(folder, robot):
+    next_walk(folder, ("ahead",))
+    with pytest.raises(InputError, match="begun with --traj ahead.toml, got s"):
+        propose.propose(Propose(folder, ("s",)))
+    log = carded(folder, robot, "ahead")
+    report(folder, log)
+    refused(folder, "no walk is waited for", log)
+    with pytest.raises(InputError, match="nothing was proposed here"):
+        report(Path("other"), log)
+
+
 # What is shown
 
 

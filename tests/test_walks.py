@@ -1,21 +1,17 @@
 """Tuning on walks: the folder, the logs, and files against walks in process."""
 
-import json
 import pickle
 from concurrent.futures import Executor, Future
-from contextlib import nullcontext
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 from model import AHEAD, BRIEF
 
-from hector_jax.cli import propose, run_folder
-from hector_jax.cli.flags import Propose, Report, Tune
+from hector_jax.cli import run_folder
+from hector_jax.cli.flags import Tune
 from hector_jax.control.weights import nominal, weights_to_vector
-from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import save_tree
 from hector_jax.robot.model import load_robot
@@ -259,30 +255,3 @@ def test_the_sets_to_choose_from_are_the_start_each_gain_and_the_answer(pool, in
     assert gains < set(numbers)
     assert len(set(numbers) - gains) <= 2  # the start and the answer
     assert any(np.array_equal(each.Q.euler, weights.Q.euler) for each in sets.values())
-
-
-def test_from_proposal_to_report_by_the_commands(monkeypatch, robot, pool, tmp_path, capsys):
-    monkeypatch.setattr(propose, "workers", {1: nullcontext(pool)}.get)  # by --processes
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "short.toml").write_text(SHORT)
-    wrong = nominal(robot)
-    save_weights(tmp_path / "far.json", wrong._replace(Q=wrong.Q._replace(euler=np.full(3, 1e9))))
-    folder, course = tmp_path / "robot", ("short.toml",)
-    with pytest.raises(InputError, match="outside the box"):
-        propose.propose(Propose(folder, course, "far.json", processes=1))
-    # flags that were refused bind nobody
-    propose.propose(Propose(folder, course, "nominal", processes=1, json=True))
-    first = json.loads(capsys.readouterr().out)
-    assert (first["walk"], first["proposed_by"]) == (0, "start")
-    with pytest.raises(InputError, match="begun with --traj short.toml, got s"):
-        propose.propose(Propose(folder, ("s",)))
-    log = str(walked(robot, load_weights(Path(first["weights"]), robot), tmp_path / "log.npz"))
-    with pytest.raises(InputError, match="a log of each of short, got 2 files"):
-        propose.report(Report(folder, (log, log)))
-    propose.report(Report(folder, (log,), processes=1, json=True))
-    seen = json.loads(capsys.readouterr().out)
-    assert (seen["walk"], seen["best"], seen["change"]) == (0, 0, 0.0)
-    with pytest.raises(InputError, match="no walk is waited for"):
-        propose.report(Report(folder, (log,), processes=1))
-    with pytest.raises(InputError, match="nothing was proposed here"):
-        propose.report(Report(tmp_path / "other", (log,)))

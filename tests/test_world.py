@@ -16,6 +16,7 @@ from hector_jax.sim.world import (
     NO_PUSH,
     Push,
     build_world,
+    build_worlds,
     hfs,
     hfs_drawn,
     hfs_even,
@@ -97,6 +98,14 @@ def test_backlash_adds_a_free_play_that_the_encoder_does_not_see():
     slack = data.qpos[world.model.jnt_qposadr[world.slack]]
     assert abs(slack[KNEE]) == pytest.approx(width, rel=0.15)
     assert np.abs(slack).max() < 1.2 * width
+
+
+def test_the_play_of_a_joint_is_free_of_all_but_a_little_damping():
+    world = build_world(hfs())
+    joints = [world.model.joint(f"{name}_backlash") for name in ROBOT.description.joints]
+    for joint in joints:
+        assert (joint.stiffness[0], joint.frictionloss[0], joint.armature[0]) == (0.0, 0.0, 0.0)
+        assert joint.damping[0] == 0.01
 
 
 def test_joint_friction_holds_against_a_small_torque():
@@ -249,6 +258,14 @@ def test_a_seed_is_a_plant():
         same = [np.concatenate([np.ravel(x) for x in jax.tree.leaves(draw(s))]) for s in (3, 3, 4)]
         np.testing.assert_array_equal(same[0], same[1])
         assert (same[0] != same[2]).any()
+
+
+def test_plants_built_together_equal_plants_built_alone():
+    plants = [hfs_varied(0), ideal(), hfs_varied(1)]
+    for plant, world in zip(plants, build_worlds(plants), strict=True):
+        alone = build_world(plant).model
+        for field in ("dof_damping", "dof_frictionloss", "body_mass", "jnt_range", "geom_solref"):
+            np.testing.assert_array_equal(getattr(world.model, field), getattr(alone, field))
 
 
 def test_a_wrong_number_is_refused_by_name():
