@@ -87,59 +87,6 @@ def test_the_line_that_asks_again_needs_no_file(tmp_path):
     assert parse.as_command("hector tune", found) == "hector tune --traj s --seeds 4"
 
 
-@pytest.mark.parametrize(
-    ("text", "fault"),
-    [
-        ("sedes = 3", "unknown field 'sedes'; did you mean 'seeds'?"),
-        ('config = "other.toml"', "config stands on the line only"),
-        ('seeds = "3"', "seeds must be a whole number from 1 to 10000, got '3'"),
-        ("seeds = 3.0", "seeds must be a whole number from 1 to 10000, got 3.0"),
-        ("quick = 1", "quick must be true or false, got 1"),
-        ('trajectories = "c"', "trajectories must be a list, each text, got 'c'"),
-        ("seeds = ", "not valid TOML: "),
-        ("seeds = 1\nseeds = 2", "not valid TOML: "),
-    ],
-)
-def test_a_wrong_file_is_one_line_with_file_and_key(tmp_path, text, fault):
-    path = written(tmp_path, text)
-    with pytest.raises(ValueError, match=r"run\.toml: ") as told:
-        from_file(Table, path)
-    assert str(told.value).startswith(f"{path}: {fault}")
-    assert "\n" not in str(told.value)
-
-
-@pytest.mark.parametrize(
-    ("key", "fault"),
-    [
-        ('world = "standing"', "must be 'ideal', 'hfs', .*did you mean 'standin'"),
-        ("seconds = 0", "seconds must be a number from 0.01 to 600, got 0"),
-        ("seconds = nan", "seconds must be a number from 0.01 to 600, got nan"),
-        (f"seconds = 1{400 * '0'}", "seconds must be a number from 0.01 to 600, got 1000"),
-    ],
-)
-def test_choices_and_ranges_hold_in_a_file(tmp_path, key, fault):
-    with pytest.raises(ValueError, match=fault):
-        from_file(Evaluate, written(tmp_path, key))
-
-
-@pytest.mark.parametrize(
-    ("name", "data", "fault"),
-    [
-        ("run.toml", b"\xff\xfe", "not a text file"),
-        ("run.json", b"[]", "no `flags` in it"),
-        ("run.json", b'{"flags": {"seeds": null}}', "seeds must be a whole number.*got None"),
-        ("run.json", b"[" * 100_000, "not valid"),
-        ("none.toml", None, "No such file"),
-    ],
-)
-def test_a_file_that_is_none_is_named(tmp_path, name, data, fault):
-    if data is not None:
-        (tmp_path / name).write_bytes(data)
-    with pytest.raises(ValueError, match=fault) as told:
-        from_file(Tune, tmp_path / name)
-    assert str(tmp_path / name) in str(told.value)
-
-
 _VALUES = (
     st.none()
     | st.booleans()

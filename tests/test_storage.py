@@ -140,51 +140,6 @@ def test_weights_come_back_as_they_were_written(tmp_path):
         jax.tree.map(np.testing.assert_array_equal, again, weights)
 
 
-def _edit(change):
-    tree = {
-        "Q": {n: [1.0, 2.0, 3.0] for n in ("euler", "position", "ang_velocity", "velocity")},
-        "R": {n: [[1e-4, 1e-4, 1e-4]] * 2 for n in ("force", "moment")},
-    }
-    change(tree)
-    return json.dumps(tree)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda t: t["Q"].pop("velocity"), 'missing weight "Q.velocity"'),
-        (lambda t: t["Q"].update(eular=[1, 1, 1]), "unknown weight 'Q.eular'; did you mean 'Q.eul"),
-        (lambda t: t["Q"].update(euler=[1, -1, 1]), r"Q.euler\[1\] must be a number from 1e-12"),
-        (lambda t: t["Q"].update(euler=[1, 1, True]), r"Q.euler\[2\] must be a number.*got True"),
-        (lambda t: t["Q"].update(euler=[1, float("nan"), 1]), r"Q.euler\[1\].*got nan"),
-        (lambda t: t["Q"].update(euler=[1, 1]), "Q.euler must be 3 numbers, got"),
-        (lambda t: t["R"].update(force=[[1, 1, 1], [1]]), "R.force must be 2 x 3 numbers, got"),
-        (
-            lambda t: t.update(others={"frition": 1}),
-            "unknown weight 'others.frition'; did you mean 'others.fri",
-        ),
-        (lambda t: t.update(others={"friction": 2}), "others.friction must be a number from 0.1"),
-        (lambda t: t.update(others={"kp": [9, 9, 9]}), "others.kp must be 5 numbers, got"),
-    ],
-)
-def test_bad_weights_are_one_line_with_file_and_entry(tmp_path, change, message):
-    path = tmp_path / "weights.json"
-    path.write_text(_edit(change))
-    with pytest.raises(ValueError, match=message) as caught:
-        load_weights(path)
-    assert "weights.json" in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("text", ["", "\udc80", '{"Q": 1, "Q": 2}', "[" * 100_000])
-def test_weights_that_are_no_json_object_are_refused(tmp_path, text):
-    path = tmp_path / "weights.json"
-    path.write_bytes(text.encode(errors="surrogateescape"))
-    with pytest.raises(ValueError, match="weights.json: ") as caught:
-        load_weights(path)
-    assert "\n" not in str(caught.value)
-
-
 @pytest.fixture
 def edited(tmp_path, monkeypatch):
     """Changes the text of a module of the package, as far as `code_hash` can see."""
