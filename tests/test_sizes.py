@@ -45,7 +45,7 @@ def test_the_plants_of_hector_are_those_that_they_always_were():
         plants[f"hfs_varied {seed}"] = hfs_varied(seed)
         plants[f"standin {seed}"] = standin(seed)
     text = json.dumps({name: exactly(plant) for name, plant in plants.items()}, sort_keys=True)
-    # of b1e541f, before other robots had sizes
+    # from before other robots had sizes
     expected = "68134952a35e59ed74a37ca45b5aa5b66a061dd66336dddb936d51dc387b7c48"
     assert hashlib.sha256(text.encode()).hexdigest() == expected
 
