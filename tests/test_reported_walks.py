@@ -26,7 +26,6 @@ from hector_jax.core.tree_file import save_tree
 from hector_jax.robot.model import load_robot
 from hector_jax.search.few_walks import Proposal
 from hector_jax.tuning.loss import loss_of_robot
-from hector_jax.walk_tuning import campaign as campaigns
 from hector_jax.walk_tuning import reported_walks, walk_log, walks
 
 SECONDS = 0.1
@@ -358,15 +357,6 @@ def test_reports_outlive_the_code_and_packages_that_took_them(walked, monkeypatc
 
 
 # From end to end
-
-
-def test_the_point_of_weights_is_the_one_that_they_came_from(folder):
-    next_walk(folder, ("ahead",))
-    one = campaign(folder)
-    space = walks.campaign_space(HandsOver(), one)
-    for point in POINTS:
-        weights = campaigns.weights_at(one, space, point)
-        np.testing.assert_allclose(campaigns.point_of(one, space, weights), point, atol=1e-12)
 
 
 def test_the_log_of_a_walk_with_the_proposed_file_is_taken(folder, robot, capsys):

@@ -18,7 +18,7 @@ from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.curvature import gauss_newton_jit
 from hector_jax.tuning.difftune import TuneConfig, init, tune, tune_step
-from hector_jax.tuning.evaluate import evaluate_jit, gradient_norms
+from hector_jax.tuning.evaluate import gradient_norms
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 
@@ -252,15 +252,6 @@ def test_the_way_back_solves_no_qp_again(robot, anchor):
     functions = lowered.as_text().split("func.func")
     solving = [f for f in functions if "solve_normal" in f.splitlines()[0] and ".while" in f]
     assert len(solving) == 1
-
-
-def test_new_weights_commands_and_effects_need_no_compilation(robot, anchor):
-    tune_step(CONFIG, Scenario(robot, named_command("s"), anchor, PLAIN), start())
-    before = evaluate_jit._cache_size()
-    other = TuneConfig(rollout=SHORT, loss=with_alphas({"L_Eul": 1.0}), beta_q=0.1, iterations=20)
-    weights = expert()._replace(others=start().others)
-    tune_step(other, Scenario(robot, named_command("c"), anchor, PLAIN), weights)
-    assert evaluate_jit._cache_size() == before
 
 
 # Numbers of the controller beside Q and R
