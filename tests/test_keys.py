@@ -22,7 +22,6 @@ from hector_jax.control.weights import nominal
 from hector_jax.core import environment, identity
 from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError
-from hector_jax.core.part import Part
 from hector_jax.qp import INTERIOR_POINT, QpConfig, Solver
 from hector_jax.robot.description import TuningSettings
 from hector_jax.search.cmaes import SearchConfig
@@ -216,23 +215,6 @@ def test_parts_whose_body_changed_have_other_keys():
         for engine in engines
     }
     assert len(names) == 2
-
-
-def test_equality_of_parts_is_an_equivalence():
-    class Kind(Part):
-        of: object
-
-    class Other(Part):
-        of: object
-
-    one, same, third = Kind("a", of=len), Kind("a", of=len), Kind("a", of=max)
-    assert one == same
-    assert hash(one) == hash(same)
-    for other in (third, Other("a", of=len), "a"):
-        assert one != other
-        assert other != one
-    assert len({one, same, third, "a"}) == 3
-    assert f"{one}" == "a"
 
 
 # Journals and collections

@@ -122,14 +122,6 @@ def test_metrics_are_read_back_as_they_were_written(tmp_path):
     assert curve[6] < curve[0]
 
 
-def test_a_damaged_line_is_named(tmp_path):
-    write_metrics(tmp_path, 4)
-    text = (tmp_path / "metrics.jsonl").read_text().replace('"iteration": 2', '"number": 2', 1)
-    (tmp_path / "metrics.jsonl").write_text(text)
-    with pytest.raises(ValueError, match=r"metrics.jsonl, line 3: an iteration .*'iteration'"):
-        runs.read_histories(tmp_path)
-
-
 def test_a_run_that_goes_on_lends_its_newest_weights(tmp_path):
     run = pretend_run(tmp_path)
     weights, told = runs.weights_of(run, "with")
