@@ -151,7 +151,7 @@ def test_either_engine_collects_the_same_walks_and_a_net_is_trained_on_them(
     """Both leave shards of one layout; the card names the engine, and resuming keeps to it."""
     monkeypatch.setattr(nets, "tuning_paths", lambda *args: [])
     # with seed 0 a walk of MuJoCo C itself jumps by more, when its delay changes by a microsecond
-    flags = ("collect", "--walks", "3", "--seconds", "0.1", "--seed", "1")
+    flags = ("collect", "--walks", "5", "--seconds", "0.1", "--seed", "1")
     found = {}
     for engine in ("c", "mjx"):
         folder = tmp_path / engine
