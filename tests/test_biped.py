@@ -37,15 +37,6 @@ STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
 foot_poses_jit = jax.jit(foot_poses)
 
 
-def copied(folder, model=lambda text: text, toml=lambda text: text):
-    """Strider with other text, in a folder of its own."""
-    xml = STRIDER.with_name("strider.xml")
-    (folder / xml.name).write_text(model(xml.read_text()))
-    path = folder / STRIDER.name
-    path.write_text(toml(STRIDER.read_text()))
-    return path
-
-
 @pytest.fixture(scope="module")
 def strider():
     return load_robot(STRIDER)
@@ -105,9 +96,10 @@ def test_imperfections_reach_the_joints_of_any_robot(strider):
     ],
 )
 def test_a_wrong_description_is_refused_in_one_line(tmp_path, old, new, words):
-    text = STRIDER.read_text()
+    text, xml, path = STRIDER.read_text(), STRIDER.with_name("strider.xml"), tmp_path / "robot.toml"
     assert old in text
-    path = copied(tmp_path, toml=lambda text: text.replace(old, new, 1))
+    path.write_text(text.replace(old, new, 1))
+    (tmp_path / xml.name).write_text(xml.read_text())
     with pytest.raises(ValueError, match=str(tmp_path)) as caught:
         walk_config(load_robot(path))
     message = str(caught.value)

@@ -114,13 +114,11 @@ def test_pairs_that_are_not_alike_are_refused(tmp_path):
 # What is read
 
 
-def posed(joints=None):
-    """MuJoCo's data, standing or with the trunk at the origin and these joints."""
+def posed():
+    """MuJoCo's model and data, standing."""
     model = compile_model(ROBOT.description)
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
-    if joints is not None:
-        data.qpos[:7], data.qpos[7:] = [0, 0, 0, 1, 0, 0, 0], joints
     mujoco.mj_forward(model, data)
     return model, data
 
