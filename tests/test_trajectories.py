@@ -80,6 +80,8 @@ def test_built_in_trajectories_are_within_the_limits(name):
     ("rows", "told"),
     [
         ([(2.0, 0.0, 0.0)], "segment 1: v_x is 2 m/s; .* walk -1 to 1.6 m/s"),
+        ([(0.5, 0.0, 0.0), (0.0, -1.5, 0.0)], "segment 2: v_y is -1.5 m/s"),
+        ([(0.0, 0.0, 5.0)], "segment 1: yaw_rate is 5 rad/s"),
         ([(1.2, 0.0, 0.0), (-0.8, 0.0, 0.0)], "segment 2: the change of v_x is -2 m/s"),
     ],
 )
