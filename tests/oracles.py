@@ -62,11 +62,7 @@ def walking_qp(seed: int, horizon: int = 10) -> QP:
     lower = np.array([-np.inf, 0, -np.inf, 0, 0, 0, -np.inf])
     upper = np.array([0, np.inf, 0, np.inf, 500, np.inf, 0])
     return QP(
-        P,
-        q,
-        np.tile(rows, (horizon, 1, 1)),
-        np.tile(lower, horizon),
-        np.tile(upper, horizon),
+        P, q, np.tile(rows, (horizon, 1, 1)), np.tile(lower, horizon), np.tile(upper, horizon)
     )
 
 

@@ -1,5 +1,7 @@
 """Walks, scores and verdicts that no simulator made, for what is only drawn, judged or written."""
 
+from unittest import mock
+
 import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,6 +16,14 @@ from hector_jax.tuning.status import StepStatus, Stop
 from hector_jax.verdict.metrics import Score, make_verdict
 
 SETS = ("nominal", "expert", "without", "with")
+
+
+def instead(patch, module, name, fake):
+    """Put a fake in the place of a function, which must be called as that one can be."""
+    present = getattr(module, name)
+    made = mock.create_autospec(getattr(present, "real", present), side_effect=fake)
+    made.real = getattr(present, "real", present)  # which has the signature, should it come again
+    patch.setattr(module, name, made)
 
 
 def pretend_walk(seed=0, error=0.03, seconds=4.0, period=0.01, fall_at=None, turn=0.0):

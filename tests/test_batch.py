@@ -16,12 +16,7 @@ from lib import sample_weights
 from model import mean_of
 
 from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.weights import (
-    directions,
-    nominal,
-    vector_to_weights,
-    weights_to_vector,
-)
+from hector_jax.control.weights import directions, nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.tree import stack
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
@@ -31,7 +26,6 @@ from hector_jax.tuning.batch import (
     BatchProblem,
     BatchScenario,
     choose_rollout,
-    lanes_of,
     tail_weights,
     tune_batch,
 )
@@ -41,7 +35,6 @@ from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
 from hector_jax.tuning.parallel_rollout import parallel_rollout
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.tuning.status import StepStatus, Stop
-from hector_jax.tuning.variation import no_variation
 
 ROBOT = load_robot()
 ANCHOR = standing_anchor(ROBOT)
@@ -149,26 +142,6 @@ def test_how_many_walk_side_by_side_does_not_matter(on_toy):
         close(one, other, rtol=1e-9, atol=1e-12)
 
 
-def test_as_many_walk_side_by_side_as_are_asked_for(on_toy, monkeypatch):
-    asked, seen = stack([problem(w, [scenario("c")]) for w in STARTS]), []
-
-    def advance(program, *rest):
-        seen.append(program.lanes)
-        raise InterruptedError
-
-    monkeypatch.setattr(batch, "_advance", advance)
-    for lanes in (3, 0, None):
-        with pytest.raises(InterruptedError):
-            tune_batch(TOY, ROBOT, asked, last_command, lanes=lanes, devices=jax.devices("cpu")[:1])
-    assert seen == [3, 0, 1]
-
-
-@pytest.mark.parametrize(("lanes", "loops"), [(1, True), (2, True), (5, False), (0, False)])
-def test_all_at_once_is_no_loop(lanes, loops):
-    program = jax.make_jaxpr(partial(batch._map, lanes, jnp.sin))(jnp.ones(5))
-    assert ("scan" in str(program)) == loops
-
-
 def test_a_start_that_falls_keeps_itself_and_says_so(on_toy):
     bad = nominal()._replace(Q=nominal().Q._replace(euler=np.array([2e3, 1.0, 1.0])))
     asked = stack([problem(w, [scenario("c")]) for w in (STARTS[0], bad)])
@@ -188,15 +161,6 @@ def test_a_batch_has_loss_weights_of_its_own_and_scales_its_losses(on_toy):
     found = tune_batch(TOY, ROBOT, stack(asked), last_command)
     first = found.history.evaluation.loss[:, 0]
     assert first[1] == pytest.approx(1.5 * first[0])
-
-
-def test_several_scenarios_are_tuned_between_their_optima(on_toy):
-    asked = [problem(nominal(), [scenario("straight"), scenario("c")], tail) for tail in (1.0, 0.0)]
-    config = TuneConfig(iterations=60, rule="relative")  # a worst case has no smooth minimum
-    found = tune_batch(config, ROBOT, stack(asked), last_command)
-    between = 0.3 * 0.25 * np.pi / 2
-    logs = np.log(vector(found.weights) / vector(nominal()))
-    np.testing.assert_allclose(logs, between, atol=0.03)
 
 
 def test_the_mean_of_scenarios_is_tuned_by_the_mean_of_their_matrices(on_toy):
@@ -235,45 +199,11 @@ def test_the_tail_is_the_mean_over_the_worst_share(tail, expected):
     np.testing.assert_allclose(found, expected)
 
 
-def test_a_cpu_walks_them_one_by_one_and_others_all_at_once():
-    assert (lanes_of("cpu"), lanes_of("gpu")) == (1, 0)
-
-
 def test_a_gpu_walks_the_ticks_of_few_rollouts_at_once():
     config = RolloutConfig(ticks=350, lead=50)
     assert choose_rollout("gpu", config, 8) is parallel_rollout
     assert choose_rollout("gpu", config, 9) is rollout
     assert choose_rollout("cpu", config, 1) is rollout
-
-
-def test_a_device_counts_the_rollouts_of_whole_problems(monkeypatch):
-    def choose(platform, config, rollouts):
-        raise LookupError(rollouts)
-
-    monkeypatch.setattr(batch, "choose_rollout", choose)
-    three = stack([problem(STARTS[0], [scenario(), scenario("s")])] * 3)
-    with pytest.raises(LookupError, match="^4$"):  # one of two devices has two of the problems
-        tune_batch(TOY, ROBOT, three, last_command, devices=2 * jax.devices()[:1])
-
-
-@pytest.mark.parametrize(
-    ("wrong", "told"),
-    [
-        ({"tail": np.array([1.5])}, r"BatchProblem.tail must be from 0 to 1, got 1.5"),
-        ({"tail": np.zeros(0)}, "stacked, one per problem"),
-        ({"effect": 3}, r"BatchScenario.effect must be below 1, got 3..3"),
-        ({"scale": 0.0}, "BatchScenario.scale must be positive"),
-        (
-            {"variation": no_variation()._replace(delay=np.asarray(0.02))},
-            "Variation.delay must be from 0 to a tick of 0.01 s, got 0.02",
-        ),
-    ],
-)
-def test_impossible_problems_are_refused(wrong, told):
-    tail = wrong.pop("tail", np.ones(1))
-    asked = stack([problem(nominal(), [scenario(**wrong)])])._replace(tail=tail)
-    with pytest.raises(ValueError, match=told):
-        tune_batch(TOY, ROBOT, asked, last_command)
 
 
 TWO_DEVICES = """
@@ -359,18 +289,6 @@ def test_two_hosts_give_the_numbers_of_one():
     for host in hosts:
         told, wrong = host.communicate(timeout=300)
         assert told.strip().endswith("same"), wrong[-2000:]
-
-
-@pytest.mark.slow
-def test_a_batch_with_all_ticks_at_once_is_that_of_ticks_in_turn():
-    config = TuneConfig(rollout=RolloutConfig(ticks=40), iterations=2)
-    asked = stack([problem(w, [scenario("s"), scenario("c")]) for w in STARTS[:2]])
-    in_turn, at_once = (
-        tune_batch(config, ROBOT, asked, last_command, lanes=0, walk=walk)
-        for walk in (rollout, parallel_rollout)
-    )
-    np.testing.assert_allclose(at_once.loss, in_turn.loss, rtol=1e-9)
-    np.testing.assert_allclose(vector(at_once.weights), vector(in_turn.weights), rtol=1e-7)
 
 
 @pytest.mark.slow  # minutes of compilation

@@ -23,6 +23,7 @@ from hector_jax.robot.model import compile_model, describe, load_robot
 
 LEGS = {  # axes in the trunk frame, from the trunk down
     4: ["x", "y", "y", "-y"],
+    5: ["x", "z", "y", "-y", "y"],  # not the order of the closed form
     6: ["-y", "x", "-z", "y", "y", "-x"],
     7: ["z", "x", "y", "-y", "z", "y", "x"],
 }
@@ -93,10 +94,12 @@ def written(folder, count):
     return path
 
 
-@pytest.fixture(scope="module", params=[*LEGS, "quadruped"])
+@pytest.fixture(scope="module", params=[*LEGS, "quadruped", "hector"])
 def made(request, tmp_path_factory):
     path = Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml"
-    if request.param in LEGS:
+    if request.param == "hector":
+        path = None
+    elif request.param in LEGS:
         path = written(tmp_path_factory.mktemp("made"), request.param)
     return load_robot(path), compile_model(describe(path))
 
@@ -155,7 +158,8 @@ def test_joints_are_found_from_feet(made):
     """In the rows that a leg places; the position always, all of the sole from six joints on."""
     robot, _ = made
     count = robot.description.leg_joints
-    assert robot.structure.placed == {3: (0, 1, 2), 4: (0, 1, 2, 4)}.get(count, tuple(range(6)))
+    placed = {3: (0, 1, 2), 4: (0, 1, 2, 4), 5: (0, 1, 2, 4, 5)}.get(count, tuple(range(6)))
+    assert robot.structure.placed == placed
     inverse = jax.jit(partial(inverse_legs, steps=20))
     start = jnp.asarray(robot.standing_joints)
     rng, legs = np.random.default_rng(1), len(robot.foot_point)
@@ -189,6 +193,17 @@ def test_rates_along_a_path_are_the_derivative_of_the_joints(made):
     J_v, _ = jacobians(robot, here)
     speeds = np.einsum("lij,lj->li", J_v, rates.reshape(legs, -1))
     np.testing.assert_allclose(speeds, moved, atol=1e-6)
+
+
+def test_a_leg_and_its_derivative_are_finite_out_of_reach(made):
+    robot, _ = made
+    start, legs = jnp.asarray(robot.standing_joints), len(robot.foot_point)
+    up, yaw = jnp.tile(jnp.array([0.0, 0.0, 1.0]), (legs, 1)), jnp.zeros(legs)
+    find = jax.jit(lambda position: inverse_legs(robot, position, yaw, up, start, steps=12))
+    slope = jax.jit(jax.jacrev(find))
+    for target in (jnp.full((legs, 3), -5.0), jnp.asarray(robot.joint_origin[:, 0])):
+        assert jnp.isfinite(find(target)).all()
+        assert jnp.isfinite(slope(target)).all()
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-6, 2e-4, 1.0, 3.0])

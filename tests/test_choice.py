@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 from model import CONFIG, ROBOT
-from pretend import tuning_of
+from pretend import instead, tuning_of
 
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import nominal
@@ -58,7 +58,7 @@ def _walk(monkeypatch, median):
             }
         )
 
-    monkeypatch.setattr(judging, "judge", judge)
+    instead(monkeypatch, judging, "judge", judge)
 
 
 STRAIGHT = named_command("straight")
@@ -72,10 +72,3 @@ def test_the_set_that_walks_best_on_drawn_plants_is_taken(monkeypatch, capsys, w
     assert choice.walks_best(SETUP, sets, commands, 3, seconds=4.0, folder=None) == winner
     said = capsys.readouterr().err
     assert f"best: {winner} of set 0 to set 3 walks best on 3 plants drawn around the hfs" in said
-
-
-def test_without_plants_the_last_one_is_taken(monkeypatch):
-    monkeypatch.setattr(judging, "judge", None)
-    sets = dict.fromkeys(("iteration 0", "iteration 5"), nominal())
-    assert choice.walks_best(SETUP, sets, (STRAIGHT,), 0) == "iteration 5"
-    assert choice.walks_best(SETUP, {"iteration 0": nominal()}, (STRAIGHT,), 4) == "iteration 0"

@@ -4,16 +4,13 @@ import json
 import re
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
-import table
 from model import BEST_OTHERS
-from pretend import pretend_verdict
+from pretend import instead
 from synthetic import synthetic_walk
 
 from hector_jax.cli import arguments, doctor, evaluate
@@ -21,36 +18,21 @@ from hector_jax.cli.flags import COMMANDS, Tune
 from hector_jax.cli.main import main
 from hector_jax.cli.parse import from_file
 from hector_jax.control.parameters import GROUPS
-from hector_jax.control.weights import (
-    expert,
-    weight_names,
-    weights_to_vector,
-)
-from hector_jax.control.weights_file import best, load_weights, save_weights
-from hector_jax.core.console import exit_code
+from hector_jax.control.weights import weight_names, weights_to_vector
+from hector_jax.control.weights_file import load_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.grfm.collection import load_walks
-from hector_jax.grfm.dataset import at_interval
-from hector_jax.grfm.effect import last_command
-from hector_jax.report import fidelity
 from hector_jax.robot.description import MODEL_PATH
 from hector_jax.robot.model import load_robot
 from hector_jax.store import nets, tunings
 from hector_jax.store.nets import CollectConfig
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
-from hector_jax.verdict import judging
-from hector_jax.walk_tuning import searches
 
 
 def call(monkeypatch, *arguments):
     monkeypatch.setattr(sys, "argv", ["hector", *map(str, arguments)])
     return main()
-
-
-def call_table(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["table.py", *map(str, arguments)])
-    return exit_code("table", table.main)
 
 
 def refused(monkeypatch, capsys, *arguments):
@@ -76,30 +58,12 @@ def test_help_opens_with_what_is_typed_first_and_names_each_command_once(words):
     assert "hector tune --traj straight" in shown.stdout.splitlines()[2]
 
 
-def test_importing_the_commands_prints_nothing_and_leaves_no_file(tmp_path):
-    shown = subprocess.run(
-        [sys.executable, "-c", "import hector_jax.cli.commands"],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-    )
-    assert (shown.returncode, shown.stdout, shown.stderr) == (0, "", "")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_walking_on_the_rigid_body_prints_json(monkeypatch, capsys):
-    assert call(monkeypatch, "walk", "--world", "srbm", "--seconds", "0.2", "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["seconds"] == pytest.approx(0.2)
-    assert not found["fell"]
-
-
 def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, capsys):
     walk = synthetic_walk(0, 30)
     fallen = np.arange(len(walk.fallen)) >= 20 * len(walk.fallen) // 30
     residual = np.where(fallen, np.inf, 0.0)
     wrong = walk._replace(fallen=fallen, residual=residual)
-    monkeypatch.setattr(arguments, "walk_once", lambda *args, **kwargs: wrong)
+    instead(monkeypatch, arguments, "walk_once", lambda *args, **kwargs: wrong)
     assert call(monkeypatch, "walk") == 1
     out, err = capsys.readouterr()
     assert "nominal weights: ended after 0.20 s" in out
@@ -108,10 +72,10 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
     found = json.loads(capsys.readouterr().out)
     assert (found["fell"], found["plans"], found["unsolved"]) == (False, 30, 10)
     assert found["residual"] is None
-    monkeypatch.setattr(
-        arguments, "walk_once", lambda *args, **kwargs: walk._replace(fallen=fallen)
+    instead(
+        monkeypatch, arguments, "walk_once", lambda *args, **kwargs: walk._replace(fallen=fallen)
     )
-    monkeypatch.setattr(evaluate, "fall_of", lambda *args: None)  # it does not fall again
+    instead(monkeypatch, evaluate, "fall_of", lambda *args: None)  # it does not fall again
     assert call(monkeypatch, "walk") == 0
     assert "nominal weights: fell after 0.20 s" in capsys.readouterr().out
 
@@ -121,77 +85,40 @@ def test_what_mujoco_warns_of_in_a_file_is_one_line(monkeypatch, capsys, tmp_pat
     (tmp_path / "hector.xml").write_text(text)
     (tmp_path / "robot.toml").write_text(MODEL_PATH.with_suffix(".toml").read_text())
     robot = tmp_path / "robot.toml"
-    assert call(monkeypatch, "walk", "--robot", robot, "--seconds", "0.05") == 0
+    assert call(monkeypatch, "robot", robot) == 0
     lines = [x for x in capsys.readouterr().err.splitlines() if "settotalmass" in x]
     assert len(lines) == 1
     assert lines[0].startswith("warning: compiler attribute 'settotalmass'")
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "says"), [("hector", "straight", 0), ("hector", "c", 1), ("quadruped", "c", 0)]
-)
-def test_a_curve_without_a_yaw_joint_is_told(capsys, name, text, says):
-    file = {"quadruped": Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml"}
-    robot = load_robot(file.get(name))
-    placed = tuple(row for row in robot.structure.placed if row != 5)
-    arguments.load_trajectory(text, robot)
-    assert capsys.readouterr().err == ""
-    robot = robot._replace(structure=replace(robot.structure, placed=placed))
-    arguments.load_trajectory(text, robot)
-    assert capsys.readouterr().err.count("no yaw joint") == says
-
-
-def test_a_newline_in_the_name_of_a_file_is_not_printed(monkeypatch, capsys, tmp_path):
-    path = tmp_path / "two\nlines.json"
-    save_weights(path, expert())
-    monkeypatch.setattr(arguments, "walk_once", lambda *args, **kwargs: synthetic_walk(0, 30))
-    assert call(monkeypatch, "walk", "--weights", path) == 0
-    assert "two lines.json weights: walked" in capsys.readouterr().out.splitlines()[0]
-
-
-@pytest.mark.parametrize("command", ["walk", "tune", "search", "evaluate"])
-def test_unknown_trajectory(monkeypatch, capsys, tmp_path, command):
-    monkeypatch.chdir(tmp_path)
-    line = refused(monkeypatch, capsys, command, "--traj", "circle")
-    assert "circle" in line
-    assert "straight, c, s" in line
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("command", ["walk", "evaluate"])
-def test_a_walk_of_no_length_is_refused(monkeypatch, capsys, command):
-    line = refused(monkeypatch, capsys, command, "--traj", "eight", "--seconds", "0")
-    assert "--seconds must be a number from 0.01 to 600, got 0.0" in line
-
-
-@pytest.mark.parametrize(
-    ("change", "expected"),
+    ("words", "fault"),
     [
-        (lambda tree: tree["Q"].pop("euler"), "euler"),
-        (lambda tree: tree["R"]["force"][1].__setitem__(2, -1.0), "R.force"),
-        (lambda tree: tree["Q"]["position"].__setitem__(0, float("nan")), "Q.position"),
-        (lambda tree: tree.__setitem__("S", 1), "S"),
+        ("walk --traj circle", "straight, c, s"),
+        ("walk --traj eight --seconds 0", "--seconds must be a number from 0.01 to 600, got 0.0"),
+        ("walk --weights exprt", "'exprt'; did you mean 'expert'?"),
+        ("walk --weights none.json", "none.json"),
+        ("tune --traj circle", "circle"),
+        ("tune --runs file", "file"),
+        ("tune --seeds 0", "seeds"),
+        ("evaluate --processes 0", "processes"),
+        ("collect --seconds 0.001", "at least 0.03 s, the 3 ticks of one sample, got 0.001"),
+        ("collect --walks 2", "at least 3"),
+        ("collect --out file/walks", "file"),
+        ("train --data none", "none"),
+        ("search --budget 9", "budget"),
+        ("search --population 3", "--population must be a whole number from 4 to 10000, got 3"),
+        ("search --start none.json", "none.json"),
     ],
 )
-def test_wrong_weights_files(monkeypatch, capsys, tmp_path, change, expected):
-    path = tmp_path / "weights.json"
-    save_weights(path, expert())
-    tree = json.loads(path.read_text())
-    change(tree)
-    path.write_text(json.dumps(tree))
-    line = refused(monkeypatch, capsys, "walk", "--weights", path)
-    assert str(path) in line
-    assert expected in line
-
-
-def test_missing_weights_file(monkeypatch, capsys, tmp_path):
-    line = refused(monkeypatch, capsys, "walk", "--weights", tmp_path / "none.json")
-    assert "none.json" in line
-
-
-def test_weights_of_an_unknown_name_are_refused_with_the_nearest(monkeypatch, capsys):
-    line = refused(monkeypatch, capsys, "walk", "--weights", "exprt")
-    assert "nominal, expert, best or a weights file, got 'exprt'; did you mean 'expert'?" in line
+def test_wrong_input_is_one_line_before_anything_is_computed(
+    monkeypatch, capsys, tmp_path, words, fault
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(nets, "tuning_paths", None)
+    Path("file").write_text("")
+    assert fault in refused(monkeypatch, capsys, *words.split())
+    assert [path.name for path in tmp_path.glob("[!.]*")] == ["file"]
 
 
 def test_a_robot_without_a_best_set_says_so(monkeypatch, capsys, tmp_path):
@@ -203,12 +130,6 @@ def test_a_robot_without_a_best_set_says_so(monkeypatch, capsys, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_the_name_best_is_the_set_of_the_robot():
-    found = arguments.weights("best", load_robot())
-    jax.tree.map(np.testing.assert_array_equal, found, best())
-    assert found.others == {**found.others, **BEST_OTHERS}
-
-
 def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "kept").write_text("mine")
@@ -217,51 +138,14 @@ def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
     assert [p.name for p in (tmp_path / "run").iterdir()] == ["kept"]
 
 
-@pytest.mark.parametrize(
-    ("wrong", "expected"),
-    [
-        (("--seconds", "0.001"), "at least 0.03 s, the 3 ticks of one sample, got 0.001"),
-        (("--seconds", "nan"), "--seconds must be a number above 0 and at most 600, got nan"),
-        (("--walks", "2"), "at least 3"),
-    ],
-)
-def test_collection_refuses_what_it_cannot_walk_at_once(
-    monkeypatch, capsys, tmp_path, wrong, expected
-):
-    monkeypatch.setattr(nets, "tuning_paths", None)  # nothing may be computed before
-    assert expected in refused(monkeypatch, capsys, "collect", "--out", tmp_path / "walks", *wrong)
-    assert not (tmp_path / "walks").exists()
-
-
-def test_collection_refuses_a_folder_it_cannot_write(monkeypatch, capsys, tmp_path):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setattr(nets, "tuning_paths", None)  # nothing may be computed before
-    assert "file" in refused(monkeypatch, capsys, "collect", "--out", tmp_path / "file" / "walks")
-
-
-def test_curves_leave_a_gap_where_a_tick_is_no_sample():
-    one = at_interval(synthetic_walk(0, 30), 0.01)
-    unsolved = np.zeros(30)
-    unsolved[11] = 1.0
-    curves = fidelity.curves(load_robot(), one, {"residual": last_command})
-    gapped = fidelity.curves(
-        load_robot(), one._replace(residual=unsolved), {"residual": last_command}
-    )
-    assert curves.keys() == gapped.keys() == {"commanded", "measured", "predicted"}
-    for name, wrench in curves.items():
-        assert np.isnan(wrench.force[:2]).all()
-        assert np.isnan(gapped[name].force[11]).all()
-        others = np.arange(30) != 11
-        np.testing.assert_array_equal(gapped[name].force[others], wrench.force[others])
-        assert np.isfinite(wrench.force[2:]).all()
-
-
 @pytest.mark.slow
-def test_either_engine_collects_the_same_walks(monkeypatch, tmp_path):
+def test_either_engine_collects_the_same_walks_and_a_net_is_trained_on_them(
+    monkeypatch, capsys, tmp_path
+):
     """Both leave shards of one layout; the card names the engine, and resuming keeps to it."""
     monkeypatch.setattr(nets, "tuning_paths", lambda *args: [])
     # with seed 0 a walk of MuJoCo C itself jumps by more, when its delay changes by a microsecond
-    flags = ("collect", "--walks", "3", "--seconds", "0.1", "--seed", "1")
+    flags = ("collect", "--walks", "5", "--seconds", "0.1", "--seed", "1")
     found = {}
     for engine in ("c", "mjx"):
         folder = tmp_path / engine
@@ -272,56 +156,12 @@ def test_either_engine_collects_the_same_walks(monkeypatch, tmp_path):
     for one, other in zip(*map(jax.tree.leaves, found.values()), strict=True):
         np.testing.assert_allclose(one, other, atol=0.01)
     assert call(monkeypatch, *flags, "--engine", "mjx", "--out", tmp_path / "c") == 2
-
-
-def test_an_unwritable_folder(monkeypatch, capsys, tmp_path):
-    (tmp_path / "file").write_text("")
-    line = refused(monkeypatch, capsys, "tune", "--runs", tmp_path / "file")
-    assert "file" in line
-
-
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        (
-            lambda text: re.sub("<keyframe>.*</keyframe>", "", text, flags=re.DOTALL).replace(
-                '<freejoint name="base"/>', ""
-            ),
-            "no keyframe 'standing'",
-        ),
-        (lambda text: text[: len(text) // 2], "hector.xml"),
-        (lambda text: text.replace("left_foot_point", "left_fot_point"), "left_foot_point"),
-        (
-            lambda text: "".join(
-                line for line in text.splitlines(True) if '<motor name="right_ankle"' not in line
-            ),
-            "right_ankle",
-        ),
-    ],
-)
-def test_wrong_robots(monkeypatch, capsys, tmp_path, change, expected):
-    path = tmp_path / "hector.xml"
-    path.write_text(change(MODEL_PATH.read_text()))
-    monkeypatch.setattr(evaluate, "load_robot", lambda _: load_robot(path))
-    line = refused(monkeypatch, capsys, "walk")
-    assert "hector.xml" in line
-    assert expected in line
-
-
-@pytest.mark.parametrize(
-    ("wrong", "says"),
-    [
-        (("--budget", "9"), "budget"),
-        (("--population", "3"), "--population must be a whole number from 4 to 10000, got 3"),
-        (("--seed", "-1"), "--seed must be a whole number from 0 to 4294967295"),
-        (("--start", "none.json"), "none.json"),
-    ],
-)
-def test_a_search_refuses_wrong_input_before_it_makes_a_folder(
-    monkeypatch, capsys, tmp_path, wrong, says
-):
-    assert says in refused(monkeypatch, capsys, "search", "--out", tmp_path / "found", *wrong)
-    assert not (tmp_path / "found").exists()
+    capsys.readouterr()
+    flags = ("--data", tmp_path / "c", "--out", tmp_path / "net.npz", "--epochs", "1", "--json")
+    assert call(monkeypatch, "train", *flags) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["net"] == str(tmp_path / "net.npz")
+    assert {"raw", "net"} <= told["errors"].keys()
 
 
 @pytest.mark.slow
@@ -350,30 +190,6 @@ def test_a_search_leaves_weights_with_a_card_and_walks_nothing_twice(monkeypatch
     assert cards == {n: json.loads(kept[tmp_path / "found" / f"{n}-card.json"]) for n in cards}
     line = refused(monkeypatch, capsys, *flags, *folders, "--seed", "1")
     assert "another search" in line
-
-
-@pytest.mark.parametrize("asked", ["json", "words"])
-def test_training_prints_the_errors_and_nothing_else(monkeypatch, capsys, tmp_path, asked):
-    errors = {"raw": {"force": 2.0, "moment": 1.0}, "net": {"force": 0.5, "moment": 0.25}}
-    monkeypatch.setattr(nets, "train_net", lambda *args: SimpleNamespace(errors=errors, args=args))
-    more = ("--json",) if asked == "json" else ()
-    assert call(monkeypatch, "train", "--out", tmp_path / "net.npz", *more) == 0
-    out = capsys.readouterr().out
-    if asked == "json":
-        assert json.loads(out) == {"net": str(tmp_path / "net.npz"), "errors": errors}
-    else:
-        assert [line.split()[0] for line in out.splitlines()[1:]] == ["raw", "net"]
-
-
-def test_a_table_prints_json_and_nothing_else(monkeypatch, capsys, tmp_path):
-    verdict = pretend_verdict()
-    made = (tmp_path / "report.md", {"c": verdict, "s": verdict})
-    monkeypatch.setattr(table, "make_table", lambda *args: made)
-    assert call_table(monkeypatch, "--json") == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["report"] == str(made[0])
-    assert told["trajectories"].keys() == {"c", "s"}
-    assert told["trajectories"]["c"]["sets"].keys() == set(verdict.scores)
 
 
 @pytest.mark.slow
@@ -446,85 +262,21 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     assert "- turn_lead: 0.5 at the start" in Path("both/report.md").read_text()
     assert "walking: straight, c" in Path("both/report.md").read_text()
 
-
-@pytest.mark.slow
-def test_the_table_is_made_and_made_again_without_a_walk(monkeypatch, capsys, tmp_path):
-    """One plant and one trajectory, really searched, tuned and walked; then all is taken up."""
-    monkeypatch.chdir(tmp_path)
-    small = CollectConfig(walks=6, seconds=1.0)
-    monkeypatch.setattr(nets, "CollectConfig", lambda: small)
-    flags = ("--trajectories", "c", "--seeds", "1", "--rollouts", "10", "--iterations", "10")
-    flags += ("--steps", "2", "--step-plants", "1")
-    assert call_table(monkeypatch, *flags) == 0
-    first = (tmp_path / "runs/table/table.csv").read_bytes()
-    monkeypatch.setattr(judging, "walk_jobs", None)
-    monkeypatch.setattr(tunings, "_tune_on_cpu", None)
-    monkeypatch.setattr(searches, "losses_on_hfs", pytest.fail)
-    assert "along walks" in capsys.readouterr().err
-    assert call_table(monkeypatch, *flags) == 0
-    assert (tmp_path / "runs/table/table.csv").read_bytes() == first
-    out, err = capsys.readouterr()
-    assert "along walks" not in err
-    for name in table.SETS:
-        assert name in out
-    assert call_table(monkeypatch, *flags, "--json") == 0
+    # the nets of these data
+    assert call(monkeypatch, "grfm", "--seeds", "0", "--json") == 0
     told = json.loads(capsys.readouterr().out)
-    assert set(table.SETS) <= told["trajectories"]["c"]["sets"].keys()
-    assert Path(told["report"]).exists()
-    assert (tmp_path / "runs/table/pictures/c.png").stat().st_size > 50_000
+    assert {"raw", "paper", "residual"} <= told["worlds"]["hfs"]["errors"].keys()
+    assert (tmp_path / told["report"]).exists()
 
 
-def test_the_table_refuses_wrong_flags_in_one_line(monkeypatch, capsys, tmp_path):
-    for words, fault in {
-        ("--extra", "mine"): "--extra must be NAME=FOLDER",
-        ("--sedes", "3"): "experiments/table.py has no flag '--sedes'; did you mean '--seeds'?",
-        ("--seeds", "3.5"): "Error parsing --seeds: expected a whole number, got '3.5'",
-        ("--seeds", "3", "--seeds", "4"): "--seeds is given twice",
-        ("3",): "experiments/table.py does not expect '3'; see python experiments/table.py --help",
-    }.items():
-        assert call_table(monkeypatch, "--out", tmp_path / "out", *words) == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith(f"table: {fault}")
-    assert not (tmp_path / "out").exists()
-
-
-def test_the_table_takes_flags_from_a_file_and_the_line_overrides_it(monkeypatch, tmp_path):
-    made = []
-
-    def make_table(flags, plants):
-        made.append(flags)
-        return tmp_path, {}
-
-    monkeypatch.setattr(table, "make_table", make_table)
-    file = tmp_path / "night.toml"
-    file.write_text('seeds = 3\nextra = ["a=x"]\n')
-    assert call_table(monkeypatch, "--config", file, "--seeds", "5") == 0
-    assert made == [table.Flags(config=file, seeds=5, extra=("a=x",))]
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        ("--processes", "0"),
-        ("--iterations", "0"),
-        ("--seeds", "0"),
-    ],
-)
-def test_wrong_numbers_leave_no_run_folder(monkeypatch, capsys, tmp_path, wrong):
-    line = refused(monkeypatch, capsys, "tune", "--out", tmp_path / "run", *wrong)
-    assert wrong[0].lstrip("-") in line
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("program", [*(f"hector {name}" for name in COMMANDS), table.PROGRAM])
-def test_every_help_tells_each_flag_and_gives_an_example(monkeypatch, capsys, program):
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_help_tells_each_flag_and_gives_an_example(monkeypatch, capsys, name):
     monkeypatch.setenv("COLUMNS", "200")
-    words = ["--help"] if program == table.PROGRAM else [program.split()[1], "--help"]
     with pytest.raises(SystemExit) as left:
-        (call_table if program == table.PROGRAM else call)(monkeypatch, *words)
+        call(monkeypatch, name, "--help")
     assert left.value.code == 0
     shown = capsys.readouterr().out
-    assert f"Example: {program}" in shown
+    assert f"Example: hector {name}" in shown
     assert "None" not in shown
     untold = [
         line for line in shown.splitlines() if re.search(r"--[\w-]+( \S+)?  +\(default", line)
@@ -532,53 +284,19 @@ def test_every_help_tells_each_flag_and_gives_an_example(monkeypatch, capsys, pr
     assert untold == []
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_completion_prints_a_script_that_knows_the_commands(monkeypatch, capsys, tmp_path, shell):
-    with pytest.raises(SystemExit) as left:
-        call(monkeypatch, "--tyro-print-completion", shell)
-    assert left.value.code in (0, None)
-    script = capsys.readouterr().out
-    for word in ("evaluate", "--first-seed", "hfs-varied", "--config"):
-        assert word.removeprefix("--") in script
-    if shell == "bash":
-        path = tmp_path / "hector"
-        path.write_text(script)
-        checked = subprocess.run(["bash", "-n", path], capture_output=True, text=True)
-        assert (checked.returncode, checked.stderr) == (0, "")
-        ask = (
-            f"source {path}; COMP_WORDS=(hector ev); COMP_CWORD=1; COMP_LINE='hector ev'; "
-            "COMP_POINT=9; $(complete -p hector | sed 's/.*-F \\([^ ]*\\).*/\\1/') hector ev; "
-            'echo "${COMPREPLY[@]}"'
-        )
-        asked = subprocess.run(["bash", "-c", ask], capture_output=True, text=True)
-        assert asked.stdout.split() == ["evaluate"]
-
-
-def test_a_doctor_that_finds_a_fault_leaves_with_one(monkeypatch, capsys):
-    walks = {"srbm": synthetic_walk(0, 30), "ideal": synthetic_walk(0, 30)}
-    monkeypatch.setattr(doctor, "_walks", lambda robot: walks)
-    monkeypatch.setattr(doctor, "write_film", lambda *args: "egl")
-    monkeypatch.setattr(doctor, "SOLVED", -1.0)
-    assert call(monkeypatch, "doctor", "--json") == 1
-    out, err = capsys.readouterr()
-    faults = [f"self-test: the robot does not walk in {world}" for world in walks]
-    assert json.loads(out)["faults"] == faults
-    assert err.splitlines()[-1] == f"hector: {'; '.join(faults)}"
-
-
 def test_the_doctor_names_an_engine_that_cannot_be_loaded(monkeypatch):
     def choose(name):
         raise InputError(f"{name} is of another Python")
 
-    monkeypatch.setattr(doctor, "choose_engine", choose)
+    instead(monkeypatch, doctor, "choose_engine", choose)
     monkeypatch.setattr(doctor, "load_robot", lambda: json.loads("no robot"))  # nor a walk
     assert {"c is of another Python", "mjx is of another Python"} < set(doctor.examine()[1])
 
 
 def test_a_sound_machine_passes_the_doctor(monkeypatch, capsys):
     walks = {"srbm": synthetic_walk(0, 30), "ideal": synthetic_walk(0, 30)}
-    monkeypatch.setattr(doctor, "_walks", lambda robot: walks)
-    monkeypatch.setattr(doctor, "write_film", lambda *args: "egl")
+    instead(monkeypatch, doctor, "_walks", lambda robot: walks)
+    instead(monkeypatch, doctor, "write_film", lambda *args: "egl")
     assert call(monkeypatch, "doctor", "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert told["faults"] == []
@@ -606,24 +324,3 @@ def test_a_reader_that_has_enough_is_no_error():
     )
     assert shown.returncode == 141
     assert shown.stderr == ""
-
-
-def test_what_a_parser_printed_before_it_exits_needs_no_reader(monkeypatch):
-    """The little that --help prints waits in a buffer until the program ends."""
-    monkeypatch.setenv("PYTHONUNBUFFERED", "")
-    work = "lambda: (time.sleep(0.5), print(1), sys.exit(0))"
-    program = f"import sys, time, hector_jax.core.console as c; sys.exit(c.exit_code('x', {work}))"
-    line = f'{sys.executable} -c "{program}" | true; exit ${{PIPESTATUS[0]}}'
-    shown = subprocess.run(["bash", "-c", line], capture_output=True, text=True)
-    assert (shown.returncode, shown.stderr) == (141, "")
-
-
-@pytest.mark.parametrize(("name", "beside"), [("nominal", "expert"), ("mine", "nominal")])
-def test_the_halves_of_a_film_have_names_of_their_own(monkeypatch, tmp_path, name, beside):
-    films = []
-    monkeypatch.setattr(arguments, "walk_once", lambda *args, **kwargs: synthetic_walk(0, 30))
-    monkeypatch.setattr(evaluate.pictures, "film", lambda path, robot, walks: films.append(walks))
-    save_weights(tmp_path / f"{name}.json", expert())
-    words = "--weights", tmp_path / f"{name}.json", "--video", tmp_path / "walk.mp4"
-    assert call(monkeypatch, "walk", *words) == 0
-    assert [list(walks) for walks in films] == [[beside, name]]

@@ -1,7 +1,6 @@
 """Flags from files: the line beats the file, the file beats the default, and faults have a name."""
 
 import json
-import sys
 from dataclasses import fields
 from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
@@ -9,16 +8,14 @@ from typing import Literal, get_args, get_origin, get_type_hints
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from table import Flags as Table
 
-from hector_jax.cli import main as cli
 from hector_jax.cli import parse
 from hector_jax.cli.flags import COMMANDS, Configured, Evaluate, Tune
 from hector_jax.cli.parse import as_table, from_file, from_line
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import convert
 
-FILES = [kind for kind in (*COMMANDS.values(), Table) if issubclass(kind, Configured)]
+FILES = [kind for kind in COMMANDS.values() if issubclass(kind, Configured)]
 
 
 def written(folder, text, name="run.toml"):
@@ -39,13 +36,6 @@ def test_the_line_beats_the_file_and_the_file_beats_the_default(tmp_path):
     assert parsed("tune").seeds == Tune().seeds
 
 
-def test_the_help_shows_what_the_file_says(tmp_path, capsys):
-    path = written(tmp_path, "seeds = 31\n")
-    with pytest.raises(SystemExit):
-        parsed("tune", "--config", path, "--help")
-    assert "(default: 31)" in capsys.readouterr().out
-
-
 def test_keys_are_spelt_as_flags_or_as_fields(tmp_path):
     for key in ("first-seed", "first_seed"):
         assert from_file(Evaluate, written(tmp_path, f"{key} = 7\n")).first_seed == 7
@@ -58,8 +48,6 @@ def test_lists_paths_and_whole_numbers_are_taken_as_their_flags_want_them(tmp_pa
     text = 'weights = ["nominal", "mine.json"]\nseconds = 2\njson = true\n'
     found = from_file(Evaluate, written(tmp_path, text))
     assert found == Evaluate(weights=("nominal", "mine.json"), seconds=2.0, json=True)
-    text = 'kept = "shelf"\nextra = ["a=x"]\n'
-    assert from_file(Table, written(tmp_path, text)) == Table(kept=Path("shelf"), extra=("a=x",))
 
 
 _MORE = {"tune": "friction", "engine": "drake", "plant": Path("more")}  # of tuples
@@ -91,129 +79,9 @@ def test_what_is_written_is_read_as_it_was(tmp_path, kind):
     assert "config" not in as_table(asked)
 
 
-def test_the_table_of_a_line_has_the_fields_of_its_command_only():
-    table = as_table(from_line(["tune", "--seeds", "3"]))
-    assert table == as_table(Tune(seeds=3))
-    assert table.keys() == {field.name for field in fields(Tune)} - {"config"}
-
-
 def test_the_line_that_asks_again_needs_no_file(tmp_path):
     found = parsed("tune", "--config", written(tmp_path, 'traj = "s"\n'), "--seeds", "4")
     assert parse.as_command("hector tune", found) == "hector tune --traj s --seeds 4"
-
-
-@pytest.mark.parametrize(
-    ("text", "fault"),
-    [
-        ("sedes = 3", "unknown field 'sedes'; did you mean 'seeds'?"),
-        ("first-sede = 3", "unknown field 'first_sede'; did you mean 'first_seed'?"),
-        ("moon = 3", "unknown field 'moon'; known: config, trajectories, "),
-        ('config = "other.toml"', "config stands on the line only"),
-        ("[tune]\nseeds = 3", "unknown field 'tune'"),
-        ('seeds = "3"', "seeds must be a whole number from 1 to 10000, got '3'"),
-        ("seeds = 3.0", "seeds must be a whole number from 1 to 10000, got 3.0"),
-        ("seeds = true", "seeds must be a whole number from 1 to 10000, got True"),
-        ("seeds = 0", "seeds must be a whole number from 1 to 10000, got 0"),
-        (
-            "first-seed = -1",
-            "first_seed must be a whole number from 0 to 4294967295, got -1",
-        ),
-        ("quick = 1", "quick must be true or false, got 1"),
-        ("data = 1", "data must be a path, got 1"),
-        ("kept = []", "kept must be a path, got []"),
-        ('trajectories = "c"', "trajectories must be a list, each text, got 'c'"),
-        ("trajectories = [1]", "trajectories must be a list, each text, got [1]"),
-        ("iterations = 0", "iterations must be a whole number from 1 to 10000, got 0"),
-        ("seeds = 1979-05-27", "seeds must be a whole number from 1 to 10000, got datetime.date"),
-        ("seeds = ", "not valid TOML: "),
-        ("seeds = 1\nseeds = 2", "not valid TOML: "),
-    ],
-)
-def test_a_wrong_file_is_one_line_with_file_and_key(tmp_path, text, fault):
-    path = written(tmp_path, text)
-    with pytest.raises(ValueError, match=r"run\.toml: ") as told:
-        from_file(Table, path)
-    assert str(told.value).startswith(f"{path}: {fault}")
-    assert "\n" not in str(told.value)
-
-
-@pytest.mark.parametrize(
-    ("key", "fault"),
-    [
-        ('world = "standing"', "must be 'ideal', 'hfs', .*did you mean 'standin'"),
-        ("world = 3", "world must be 'ideal', .*got 3"),
-        ("seconds = 0", "seconds must be a number from 0.01 to 600, got 0"),
-        ("seconds = 601.0", "seconds must be a number from 0.01 to 600, got 601"),
-        ("seconds = nan", "seconds must be a number from 0.01 to 600, got nan"),
-        (f"seconds = 1{400 * '0'}", "seconds must be a number from 0.01 to 600, got 1000"),
-        (
-            "first-seed = 4294967296",
-            "first_seed must be a whole number from 0 to 4294967295, got 4294967296",
-        ),
-        ("seconds = inf", "seconds must be a number from 0.01 to 600, got inf"),
-        ('seconds = "long"', "seconds must be a number from 0.01 to 600, got 'long'"),
-    ],
-)
-def test_choices_and_ranges_hold_in_a_file(tmp_path, key, fault):
-    with pytest.raises(ValueError, match=fault):
-        from_file(Evaluate, written(tmp_path, key))
-
-
-@pytest.mark.parametrize(
-    ("name", "data", "fault"),
-    [
-        ("run.toml", b"\xff\xfe", "not a text file"),
-        ("run.toml", b"seeds = 1" + b"0" * 5000, "not valid TOML"),
-        ("run.json", b"{", "not valid JSON"),
-        ("run.json", b"[]", "no `flags` in it"),
-        ("run.json", b'{"tune": {}}', "no `flags` in it"),
-        (
-            "run.json",
-            b'{"flags": {"seeds": null}}',
-            "seeds must be a whole number.*got None",
-        ),
-        ("run.json", b"[" * 100_000, "not valid"),
-        ("run.toml", b"a = " + b"[" * 100_000, "not valid"),
-        ("none.toml", None, "No such file"),
-    ],
-)
-def test_a_file_that_is_none_is_named(tmp_path, name, data, fault):
-    if data is not None:
-        (tmp_path / name).write_bytes(data)
-    with pytest.raises(ValueError, match=fault) as told:
-        from_file(Tune, tmp_path / name)
-    assert str(tmp_path / name) in str(told.value)
-
-
-def test_the_program_tells_a_wrong_file_in_one_line(monkeypatch, capsys, tmp_path):
-    path = written(tmp_path, "seeds = 0\n")
-    monkeypatch.setattr(sys, "argv", ["hector", "tune", "--config", str(path)])
-    assert cli.main() == 2
-    out, err = capsys.readouterr()
-    assert (out, err) == (
-        "",
-        f"hector: {path}: seeds must be a whole number from 1 to 10000, got 0\n",
-    )
-
-
-@pytest.mark.parametrize(
-    ("wrong", "fault"),
-    [
-        (Tune(seeds=0), "--seeds must be a whole number from 1 to 10000, got 0"),
-        (
-            Evaluate(first_seed=-2),
-            "--first-seed must be a whole number from 0 to 4294967295, got -2",
-        ),
-    ],
-)
-def test_flags_are_held_to_their_ranges(wrong, fault):
-    with pytest.raises(ValueError, match=fault):
-        parse.check(wrong)
-
-
-@pytest.mark.parametrize("kind", FILES)
-def test_the_defaults_are_in_range(kind):
-    parse.check(kind())
 
 
 _VALUES = (

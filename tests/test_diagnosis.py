@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from pretend import pretend_walk
+from pretend import instead, pretend_walk
 
 from hector_jax.cli import arguments, evaluate
 from hector_jax.cli import tune as tuning
@@ -18,7 +18,6 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import nominal
 from hector_jax.core.inputs import InputError
-from hector_jax.report.report import render
 from hector_jax.robot.model import load_robot
 from hector_jax.sim import diagnosis
 from hector_jax.sim.diagnosis import Fall, Record, likeliest_cause, not_the_weights
@@ -26,12 +25,9 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
-from hector_jax.store import tunings
 from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.evaluate import Evaluation
-from hector_jax.tuning.loss import PAPER_LOSS
-from hector_jax.verdict import judging, metrics
+from hector_jax.verdict import judging
 
 ROBOT, STRAIGHT = load_robot(), named_command("straight")
 JOB = Job(nominal(), STRAIGHT, hfs(), 1.0)
@@ -79,7 +75,6 @@ def unsolved():
     ("record", "cause"),
     [
         (recorded(height=np.nan), "the physics diverges"),
-        (recorded(fallen=False), "the physics diverges"),
         (recorded(-0.2, walked=unsolved()), "a QP of the MPC is not solved"),
         (recorded(-0.2, knee=1.0), "the torque of left_knee is at its limit of 67 N m for 100 %"),
         (recorded(-0.2, sole=(0.0, 0.3)), "the right foot stands on an edge of its sole"),
@@ -90,20 +85,12 @@ def unsolved():
         (recorded(-0.2), "the centre of mass sinks steadily, by 9 cm while still upright"),
         (recorded(0.2, (0.0, 0.3)), "the centre of mass rises steadily, by 20 cm"),
         (recorded(0.06, (0.0, 0.9)), "it tips over forwards"),
-        (recorded(0.0, (0.0, -0.9)), "it tips over backwards"),
         (recorded(0.0, (0.9, 0.1)), "it tips over to the right"),
-        (recorded(0.0, (-0.9, 0.1)), "it tips over to the left"),
         (recorded(0.0, (0.0, 0.3), touching="left_shin"), "left_shin touches the floor"),
     ],
 )
 def test_the_likeliest_cause_follows_from_what_came_before_the_fall(record, cause):
     assert likeliest_cause(ROBOT, record).startswith(cause)
-
-
-def test_torques_of_a_robot_that_is_half_over_are_nobodys_fault():
-    record = recorded(0.0, (0.0, 0.9))
-    record.torque[record.tilt > 0.5] = 1.0
-    assert "tips over" in likeliest_cause(ROBOT, record)
 
 
 def test_a_fall_in_the_start_up_is_that_of_the_walk():
@@ -127,22 +114,15 @@ def test_a_fall_in_the_start_up_is_that_of_the_walk():
     assert diagnosis.fall_of(config, ROBOT, JOB._replace(seconds=0.05)) is None
 
 
-@pytest.mark.parametrize(
-    ("plant", "cause"),
-    [
-        (hfs()._replace(floor_friction=np.array(0.22)), "foot slips"),
-        (hfs()._replace(torque_gain=np.full(10, 0.3)), "sinks steadily"),
-    ],
-)
-def test_a_fall_of_a_walk_has_the_cause_of_its_plant(plant, cause):
-    s, config = named_command("s"), WalkConfig()
-    job = JOB._replace(command=s, imperfections=plant, seconds=2.0)
+def test_a_fall_of_a_walk_has_the_cause_of_its_plant():
+    icy, config = hfs()._replace(floor_friction=np.array(0.22)), WalkConfig()
+    job = JOB._replace(command=named_command("s"), imperfections=icy, seconds=2.0)
     walked = walk(config, ROBOT, job)
     fall = diagnosis.fall_of(config, ROBOT, job)
     assert fall is not None
     assert fall.time > 0.0
     assert fall.time == pytest.approx(0.001 * np.sum(~walked.fallen))
-    assert cause in fall.cause
+    assert "foot slips" in fall.cause
     assert str(fall).startswith(f"fell after {fall.time:.2f} s: ")
 
 
@@ -176,14 +156,6 @@ def test_a_height_that_is_off_and_motors_at_their_limits_are_told(monkeypatch):
     assert torque.startswith(f"{text} (try a slower trajectory")
 
 
-def test_what_leads_to_a_fall_is_not_told_as_steady(monkeypatch):
-    walked = settled(0.0)
-    walked.state.position[150:, 2] -= 0.3
-    record = recorded(walked=walked)
-    record.torque[500:] = 1.0
-    assert lines(monkeypatch, record) == []
-
-
 def test_a_start_that_falls_is_refused_before_anything_is_collected(monkeypatch, tmp_path):
     made = []
 
@@ -191,8 +163,8 @@ def test_a_start_that_falls_is_refused_before_anything_is_collected(monkeypatch,
         made.extend(jobs)
         yield from (pretend_walk(fall_at=0.5 if job.command is S else None) for job in jobs)
 
-    monkeypatch.setattr(judging, "walk_jobs", walks_of)
-    monkeypatch.setattr(tuning, "fall_of", lambda *args: FALL)
+    instead(monkeypatch, judging, "walk_jobs", walks_of)
+    instead(monkeypatch, tuning, "fall_of", lambda *args: FALL)
     both = [NamedCommand(name, named_command(name)) for name in ("straight", "s")]
     S = both[1].command
     with ThreadPoolExecutor(1) as pool:
@@ -209,35 +181,12 @@ def test_a_start_that_falls_is_refused_before_anything_is_collected(monkeypatch,
     assert len(made) == 2
 
 
-def test_a_start_that_falls_on_the_model_is_refused_before_anything_is_collected(monkeypatch):
-    zero = np.zeros(())
-    fell = Evaluation(zero, {}, nominal(), fallen=np.ones(()), residual=zero)
-    monkeypatch.setattr(tunings.difftune, "tune_step", lambda *args, **model: fell)
-    problem = tunings.Problem((named_command("straight"),), None)
-    with pytest.raises(InputError, match="the robot fell .try a slower or shorter trajectory"):
-        tunings._prepare_tuning(TuneConfig(), ROBOT, nominal(), problem)
-
-
-def test_a_tuned_set_that_walks_worse_than_nominal_is_told(capsys):
-    def scored(L):
-        score = metrics.score_like()
-        score = score._replace(losses=score.losses | {"L": np.array(L)})
-        last = pretend_walk().initial
-        return [judging.ScoredWalk(score, np.array(4.0), last, "", "")]
-
-    walks = {"nominal": scored(2e6), "without": scored(3e6), "with": scored(1e6)}
-    tuning._say_worse("straight", judging.ScoredWalks(walks, {}))
-    said = capsys.readouterr().err
-    assert "straight: on the high-fidelity simulator `without` walks with L 3e6, nominal" in said
-    assert "`with`" not in said
-
-
 # How a fall in the start-up is told
 
 
 def test_hector_walk_tells_the_fall_and_prints_no_nan(monkeypatch, capsys):
-    monkeypatch.setattr(arguments, "walk_once", lambda *args, **kwargs: fallen_at_once())
-    monkeypatch.setattr(evaluate, "fall_of", lambda *args: FALL)
+    instead(monkeypatch, arguments, "walk_once", lambda *args, **kwargs: fallen_at_once())
+    instead(monkeypatch, evaluate, "fall_of", lambda *args: FALL)
     monkeypatch.setattr(sys, "argv", ["hector", "walk"])
     assert main() == 0
     out = capsys.readouterr().out
@@ -249,39 +198,3 @@ def test_hector_walk_tells_the_fall_and_prints_no_nan(monkeypatch, capsys):
     assert (told["seconds"], told["fell"]) == (-0.42, True)
     assert told["fall"] == FALL._asdict()
     assert told["rms_position"] == [None] * 3
-
-
-def test_an_evaluation_has_the_fall_before_t_0_and_tells_it_once_a_set(
-    monkeypatch, tmp_path, capsys
-):
-    made = []
-
-    def walks_of(setup, jobs, title, engine):
-        for job in jobs:
-            made.append(job.seed)
-            yield pretend_walk(1, seconds=1.0) if job.seed == 1 else fallen_at_once(job.seed)
-
-    monkeypatch.setattr(judging, "walk_jobs", walks_of)
-    monkeypatch.setattr(judging, "fall_of", lambda *args: FALL)
-    for _ in range(2):  # as walked, and from the folder
-        with ThreadPoolExecutor(1) as pool:
-            found = judging.judge(
-                Setup(pool, TuneConfig(), ROBOT),
-                {"mine": nominal()},
-                STRAIGHT,
-                [hfs()] * 3,
-                range(3),
-                title="",
-                folder=tmp_path,
-            )
-        assert [float(one.upright) for one in found.walks["mine"]] == [-0.42, 1.0, -0.42]
-        assert f"mine: 2 of 3 walks {TEXT}\n" in capsys.readouterr().err
-    assert made == [0, 1, 2]
-
-
-def test_the_table_of_a_set_that_always_falls_at_once_has_no_nan():
-    scores = [metrics.score(PAPER_LOSS, fallen_at_once())] * 2
-    verdict = metrics.make_verdict(PAPER_LOSS, [0, 1], {"s": {"nominal": scores}})
-    text = render("verdict.md.j2", verdict=verdict)
-    assert "nan" not in text
-    assert "| nominal | - | - | - | - | - | - |" in text

@@ -14,14 +14,7 @@ from hector_jax.cli.flags import Tunables
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.mpc import MpcConfig
-from hector_jax.control.parameters import (
-    GROUPS,
-    TUNABLES,
-    bounds,
-    step_bounds,
-    step_names,
-    stepped,
-)
+from hector_jax.control.parameters import GROUPS, TUNABLES, bounds, step_bounds, step_names, stepped
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
 from hector_jax.control.weights import (
     directions,
@@ -46,12 +39,11 @@ from hector_jax.tuning.difftune import (
 )
 from hector_jax.tuning.evaluate import Evaluation, Objective, aligned
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
-from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.rollout import RolloutConfig, Scenario
 from hector_jax.tuning.status import StepStatus, Stop, status_text
 
 ROBOT = load_robot()
 ANCHOR = standing_anchor(ROBOT)
-STRAIGHT = named_command("straight")
 
 
 def vector(weights):
@@ -104,23 +96,6 @@ def test_the_literal_step_is_theta_less_beta_times_the_gradient():
     np.testing.assert_allclose(vector(moved), np.clip(expected, *map(vector, bounds())), rtol=1e-12)
 
 
-@pytest.mark.parametrize("rule", ["gauss_newton", "relative"])
-def test_the_size_of_the_loss_does_not_matter(rule):
-    config, state = TuneConfig(rule=rule), init(TuneConfig(rule=rule), nominal())
-    found = [evaluation(loss=k, gradient=random_tree(2, k)) for k in (1.0, 1e9)]
-    one, other = (
-        update(config, state, each, k * jnp.eye(18))[0].steps
-        for each, k in zip(found, (1.0, 1e9), strict=True)
-    )
-    np.testing.assert_allclose(one, other, rtol=1e-9)
-
-
-@pytest.mark.parametrize("rule", ["gauss_newton", "relative", "literal"])
-def test_a_zero_gradient_moves_nothing(rule):
-    still = stepped_once(random_tree(0, 0.0), TuneConfig(rule=rule))
-    np.testing.assert_allclose(vector(still), vector(nominal()), rtol=1e-15)
-
-
 @pytest.mark.parametrize("rule", ["gauss_newton", "relative", "literal"])
 @pytest.mark.parametrize("side", [0, 1])
 def test_a_step_out_of_the_box_ends_exactly_on_its_wall(side, rule):
@@ -163,10 +138,6 @@ def rejection_reason(found):
     return status_text(StepStatus(int(step_status(TuneConfig(), found))), found)
 
 
-def test_a_sound_evaluation_is_believed():
-    assert rejection_reason(evaluation()) == ""
-
-
 @pytest.mark.parametrize(
     ("wrong", "told"),
     [
@@ -179,11 +150,6 @@ def test_a_sound_evaluation_is_believed():
 )
 def test_what_cannot_be_believed_is_refused_and_told(wrong, told):
     assert told in rejection_reason(evaluation(**wrong))
-
-
-def test_a_gradient_with_one_nan_is_refused():
-    gradient = vector_to_weights(jnp.ones(24).at[17].set(jnp.nan))
-    assert "not finite" in rejection_reason(evaluation(gradient=gradient))
 
 
 # The loop, on a quadratic in log-weights whose optimum is known
@@ -331,30 +297,6 @@ def test_the_matrix_is_taken_where_a_step_was_accepted_and_nowhere_else():
     assert taken == []
 
 
-def test_each_iteration_is_numbered_and_the_first_is_the_start():
-    for config in (EXACT, RELATIVE):
-        found = tune_toy(quadratic(), config)
-        history = found.iterations
-        assert [int(i.iteration) for i in history] == list(range(len(history)))
-        np.testing.assert_array_equal(vector(history[0].weights), vector(nominal()))
-        assert [float(i.step_size) for i in history[:2]] == [0.0, 1.0]
-
-
-def test_a_start_that_falls_is_refused():
-    seen = []
-    with pytest.raises(ValueError, match="the starting weights cannot be tuned from: the robot"):
-        tune_toy(quadratic(falls=lambda weights: True), on_iteration=seen.append)
-    assert len(seen) == 1
-
-
-def test_the_papers_steps_end_where_all_are_refused():
-    toy = quadratic(falls=lambda w: not np.array_equal(vector(w), vector(nominal())))
-    found = tune_toy(toy, TuneConfig(rule="relative", iterations=30))
-    assert Stop(int(found.stop)) == Stop.SMALL_STEP
-    assert [float(i.step_size) for i in found.iterations[1:]] == [0.5**i for i in range(8)]
-    np.testing.assert_array_equal(vector(found.weights), vector(nominal()))
-
-
 @pytest.mark.parametrize("rule", ["gauss_newton", "relative"])
 def test_an_optimum_outside_the_box_ends_on_its_wall(rule):
     outside = OPTIMUM.copy()
@@ -365,15 +307,6 @@ def test_an_optimum_outside_the_box_ends_on_its_wall(rule):
     assert max(i.weights.Q.position[0] for i in found.iterations) == 1e4
     others = np.delete(np.log(vector(found.weights) / OPTIMUM), 3)
     assert np.abs(others).max() < 0.1
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [{"rule": "adam"}, {"beta_q": 0.0}, {"beta_r": -1.0}, {"iterations": 0}, {"ridge": -1e-3}],
-)
-def test_impossible_settings_are_refused(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        TuneConfig(**wrong)
 
 
 # On the rigid body
@@ -390,24 +323,12 @@ def test_a_start_whose_feet_differ_is_tied_and_stays_tied():
     np.testing.assert_array_equal(vector(equal), vector(expert()))  # to the last bit
 
 
-def test_a_loss_is_not_aligned_without_the_norm_of_a_term():
-    with pytest.raises(InputError, match="unknown term of the loss 'L_pos'"):
-        aligned(PAPER_LOSS, {"L_Eul": 0.3, "L_ctrl": 2e4})
-
-
 def test_aligned_loss_weights_are_powers_of_ten_that_level_the_gradients():
     config = aligned(PAPER_LOSS, {"L_Eul": 0.3, "L_pos": 4e-3, "L_ctrl": 2e4})
     assert config == with_alphas({"L_Eul": 1e5, "L_pos": 1e7})
     for gradient, term in zip((0.3, 4e-3), config, strict=False):
         alpha = term.weight
         assert 10**-0.5 <= alpha * gradient / 2e4 <= 10**0.5
-
-
-def test_a_loss_without_control_is_aligned_to_its_last_term():
-    loss = (PAPER_LOSS[1]._replace(weight=7.0), PAPER_LOSS[0]._replace(weight=3.0))
-    first, last = (term.name for term in loss)
-    found = aligned(loss, {first: 1.0, last: 100.0})
-    assert {term.name: term.weight for term in found} == {first: 300.0, last: 3.0}
 
 
 def test_the_mean_of_objectives_begins_at_the_mean_of_their_losses_with_equal_parts():
@@ -437,7 +358,7 @@ def test_ten_iterations_go_below_a_hundred_of_the_papers_inside_the_box():
     lower, upper = map(vector, bounds())
     papers = TuneConfig(rule="relative", iterations=100)
     for name in COMMANDS:
-        inputs = ROBOT, nominal(), named_command(name), ANCHOR, last_command
+        inputs = Scenario(ROBOT, named_command(name), ANCHOR, last_command), nominal()
         found, with_ridge = tune(TuneConfig(ridge=0.0), *inputs), tune(TuneConfig(), *inputs)
         history = found.iterations
         assert len(history) <= 11, name
@@ -490,7 +411,6 @@ def test_a_trust_region_holds_shares_of_boxes_as_it_holds_logs():
     [
         ({"others": ("turn_laed",)}, "did you mean 'turn_lead'"),
         ({"others": ("foot_height",)}, "foot_height cannot be tuned by gradients"),
-        ({"others": ("position_limit",)}, "position_limit cannot be tuned by gradients"),
         (
             {"others": ("friction",), "rule": "literal"},
             "others must be empty with the rule literal",

@@ -32,13 +32,6 @@ def weak(window: Window):
     return ground_effect(wrench._replace(force=0.9 * wrench.force, moment=moment))
 
 
-def test_gains_of_zero_estimate_nothing():
-    off = AT_REST._replace(position=np.array([0.1, -0.2, 0.3]), euler=np.array([0.1, 0.2, 0.3]))
-    zero = IntegralGains(0.0, 0.0, 0.0, 0.0)
-    found = integrate(zero, NO_DISTURBANCE, off, AT_REST, 0.01)
-    assert all((x == 0.0).all() for x in found)
-
-
 def test_a_robot_too_low_lacks_force_and_is_seen_in_its_yaw_frame():
     heading = np.array([0.0, 0.0, np.pi / 2])  # it looks along y
     there = AT_REST._replace(euler=heading, position=np.array([0.0, -0.01, -0.02]))

@@ -208,8 +208,7 @@ def crouched(params):
 
 
 @pytest.mark.parametrize(
-    ("spoil", "reason"),
-    [(spoilt_net, "loss or gradient not finite"), (crouched, "the robot fell")],
+    ("spoil", "reason"), [(spoilt_net, "loss or gradient not finite"), (crouched, "the robot fell")]
 )
 def test_a_start_that_cannot_be_believed_ends_the_run(params, spoil, reason):
     command, net, robot = spoil(params)

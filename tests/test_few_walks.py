@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-from hector_jax.core import inputs
-from hector_jax.core.inputs import InputError
 from hector_jax.search.few_walks import (
     METHODS,
     Model,
@@ -163,13 +161,3 @@ def test_the_luckiest_walk_is_not_believed(history):
     lucky = min(row.loss for row in history) - 0.02
     walks = [*history, *around[:-1], around[-1]._replace(loss=lucky)]
     assert incumbent(SPACE, walks) != len(walks) - 1
-
-
-@pytest.mark.parametrize("package", ["tinygp", "cmaes"])
-def test_a_missing_package_is_named_with_its_extra(monkeypatch, history, package):
-    there = inputs.find_spec
-    monkeypatch.setattr(inputs, "find_spec", lambda name: None if name == package else there(name))
-    methods = [row.method for row in history]
-    count = methods.index({"tinygp": "surrogate", "cmaes": "evolution"}[package])
-    with pytest.raises(InputError, match=rf"{package}: pip install 'hector-jax\[search\]'"):
-        propose(SPACE, history[:count], model)

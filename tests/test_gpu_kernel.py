@@ -7,10 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.experimental import pallas
 from oracles import exact_solution, walking_qp
 
-from hector_jax.qp import active_set, gpu_kernel
+from hector_jax.qp import gpu_kernel
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -55,17 +54,6 @@ def test_only_small_problems_fit():
     assert gpu_kernel.fits(gpu_kernel.VARIABLES, gpu_kernel.ROWS)
     assert not gpu_kernel.fits(100, 110)
     assert not gpu_kernel.fits(50, 220)
-
-
-def test_without_triton_a_gpu_takes_the_slower_path(monkeypatch):
-    said = []
-    monkeypatch.setattr(active_set, "say", said.append)
-    monkeypatch.delattr(pallas, "triton")
-    monkeypatch.setitem(sys.modules, "jax.experimental.pallas.triton", None)
-    assert active_set._kernel.__wrapped__(50, 110, True) is None
-    assert said == [
-        "on a GPU a QP of 50 variables and 110 rows takes the slower path: this JAX has no Triton"
-    ]
 
 
 def test_the_package_loads_without_triton():

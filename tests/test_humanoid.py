@@ -32,7 +32,7 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
-from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.rollout import RolloutConfig, Scenario
 
 ROBOT = load_robot(Path(__file__).parents[1] / "examples" / "humanoid" / "robot.toml")
 CONFIG = walk_config(ROBOT)
@@ -142,11 +142,10 @@ def test_gains_in_a_weights_file_are_one_for_each_joint(tmp_path):
 def check_gradients(robot):
     """The gradient is that of differences: over 50 ticks to 1e-6, over 4 s to 1e-4."""
     short, long = (RolloutConfig(walk=walk_config(robot), ticks=ticks) for ticks in (50, 400))
-    model, weights = (standing_anchor(robot), last_command), nominal(robot)
-    check_gradient(
-        short, robot, weights, named_command("s"), *model, 1e-6, OBLIQUE, case="50 ticks"
-    )
-    check_gradient(long, robot, weights, named_command("c"), *model, 1e-4, case="4 s")
+    anchor, weights = standing_anchor(robot), nominal(robot)
+    s, c = (Scenario(robot, named_command(name), anchor, last_command) for name in "sc")
+    check_gradient(short, s, weights, 1e-6, OBLIQUE, case="50 ticks")
+    check_gradient(long, c, weights, 1e-4, case="4 s")
 
 
 @pytest.mark.slow

@@ -5,16 +5,18 @@ Nothing is compiled: loaders and checks alone.
 
 import dataclasses
 import json
+from functools import partial
 from typing import get_args, get_origin
 
 import jax
 import numpy as np
 import pytest
-from adaptation import OnlineConfig
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from scenes import SceneConfig
 
+from hector_jax.cli.flags import Evaluate, Tune
+from hector_jax.cli.parse import from_file
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.gait import GaitConfig
@@ -23,8 +25,8 @@ from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.trajectories import load_command
 from hector_jax.control.weights import expert
 from hector_jax.control.weights_file import load_weights, save_weights
-from hector_jax.core.inputs import InputError, did_you_mean, short_repr
-from hector_jax.core.settings import Range, convert
+from hector_jax.core.inputs import InputError, short_repr
+from hector_jax.core.settings import convert
 from hector_jax.core.tree_file import save_tree
 from hector_jax.grfm import collection, network
 from hector_jax.grfm.training import TrainConfig
@@ -81,7 +83,6 @@ CONFIGS = (
     RolloutConfig,
     TuneConfig,
     SearchConfig,
-    OnlineConfig,
     TrainConfig,
     CollectConfig,
     SceneConfig,
@@ -153,18 +154,81 @@ def test_defaults_and_numpy_numbers_are_taken():
     assert made(MpcConfig, horizon=np.int64(5), friction=np.float64(0.5)).horizon == 5
 
 
-def test_ranges_and_hints_are_told_in_words():
-    assert validation_error(3, int, Range(5, 9)) == ("must be a whole number from 5 to 9, got 3")
-    assert validation_error(True, float) == "must be a number that is finite, got True"
-    assert validation_error(0.0, float | None, Range(0.0, above=True)).startswith(
-        "must be a number above"
-    )
-    assert validation_error(None, float | None) is None
-    assert validation_error("wieght", str, ("zero", "weight")) == (
-        "must be 'zero' or 'weight', got 'wieght'; did you mean 'weight'?"
-    )
-    assert did_you_mean("xyz", ["zero", "weight"]) == ""
-    assert len(short_repr("x" * 1000)) == 60
+# One case a line: of each kind of fault one, for each loader
+
+
+def edited(part, entry, value):
+    """The text of a file of weights with another entry."""
+    tree = {
+        "Q": {n: [1.0, 2.0, 3.0] for n in ("euler", "position", "ang_velocity", "velocity")},
+        "R": {n: [[1e-4, 1e-4, 1e-4]] * 2 for n in ("force", "moment")},
+        "others": {},
+    }
+    tree[part][entry] = value
+    return json.dumps(tree)
+
+
+LOADERS = {
+    "weights.json": load_weights,
+    "tune.toml": partial(from_file, Tune),
+    "tune.json": partial(from_file, Tune),
+    "evaluate.toml": partial(from_file, Evaluate),
+    "course.toml": load_command,
+}
+HEAD = 'name = "mine"\n[[segment]]\nseconds = 1.0\n'
+REFUSED = [
+    ("weights.json", '{"Q": {}, "R": {}}', 'missing weight "Q.euler"'),
+    ("weights.json", edited("Q", "eular", [1, 1, 1]), "weight 'Q.eular'; did you mean 'Q.euler'"),
+    ("weights.json", edited("Q", "euler", [1, -1, 1]), "Q.euler[1] must be a number from 1e-12"),
+    ("weights.json", edited("Q", "euler", [1, 1, True]), "Q.euler[2] must be a number"),
+    ("weights.json", edited("Q", "euler", [1, float("nan"), 1]), "got nan"),
+    ("weights.json", edited("Q", "euler", [1, 1]), "Q.euler must be 3 numbers, got"),
+    ("weights.json", edited("R", "force", [[1, 1, 1], [1]]), "R.force must be 2 x 3 numbers, got"),
+    ("weights.json", edited("others", "frition", 1), "did you mean 'others.friction'"),
+    ("weights.json", edited("others", "friction", 2), "others.friction must be a number from 0.1"),
+    ("weights.json", edited("others", "kp", [9, 9, 9]), "others.kp must be 5 numbers, got"),
+    ("weights.json", "", ""),
+    ("weights.json", "\udc80", ""),
+    ("weights.json", '{"Q": 1, "Q": 2}', ""),
+    ("weights.json", "[" * 100_000, ""),
+    ("tune.toml", "sedes = 3", "unknown field 'sedes'; did you mean 'seeds'?"),
+    ("tune.toml", 'config = "other.toml"', "config stands on the line only"),
+    ("tune.toml", 'seeds = "3"', "seeds must be a whole number from 1 to 10000, got '3'"),
+    ("tune.toml", "seeds = 3.0", "seeds must be a whole number from 1 to 10000, got 3.0"),
+    ("tune.toml", "video = 1", "video must be true or false, got 1"),
+    ("tune.toml", "seeds = ", "not valid TOML: "),
+    ("tune.toml", "seeds = 1\nseeds = 2", "not valid TOML: "),
+    ("tune.toml", "\udcff\udcfe", "not a text file"),
+    ("tune.json", "[]", "no `flags` in it"),
+    ("tune.json", '{"flags": {"seeds": null}}', "seeds must be a whole number"),
+    ("tune.json", "[" * 100_000, "not valid"),
+    ("evaluate.toml", 'world = "standing"', "did you mean 'standin'"),
+    ("evaluate.toml", "seconds = 0", "seconds must be a number from 0.01 to 600, got 0"),
+    ("evaluate.toml", "seconds = nan", "seconds must be a number from 0.01 to 600, got nan"),
+    ("evaluate.toml", f"seconds = 1{400 * '0'}", "from 0.01 to 600, got 1000"),
+    ("course.toml", "", "missing field 'name'"),
+    ("course.toml", 'name = "mine"', "missing field 'segment'"),
+    ("course.toml", "name = 3\nsegment = [{seconds = 1}]", "name must be text, got 3"),
+    ("course.toml", 'name = "s"\nsegment = [{seconds = 1}]', "built-in trajectory"),
+    ("course.toml", HEAD + "vx = 0.3", "segment 1: unknown field 'vx'; did you mean 'v_x'"),
+    ("course.toml", HEAD + "v_x = nan", "segment 1: v_x must be a number from -10 to 10, got nan"),
+    ("course.toml", HEAD + f"v_x = 0x{'f' * 9000}", "too many digits"),
+    ("course.toml", HEAD + "[[segment]]\nv_x = 1.0", "segment 2: missing field 'seconds'"),
+    ("course.toml", HEAD + "[[segment]]\nseconds = -1", "segment 2: seconds must be"),
+    ("course.toml", HEAD + "[[segment]]\nseconds = 600", "at most 600 s together, got 601"),
+    *((name, None, "No such file") for name in ("tune.toml", "course.toml")),
+]
+
+
+@pytest.mark.parametrize(("name", "text", "fault"), REFUSED)
+def test_a_wrong_file_is_one_line_with_file_field_and_value(tmp_path, name, text, fault):
+    if text is not None:
+        (tmp_path / name).write_bytes(text.encode(errors="surrogateescape"))
+    with pytest.raises(InputError) as caught:
+        LOADERS[name](tmp_path / name)
+    message = one_line(caught.value)
+    assert str(tmp_path / name) in message
+    assert fault in message
 
 
 # Files

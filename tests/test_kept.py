@@ -1,27 +1,23 @@
 """What is kept is taken up, and only where the same is asked."""
 
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
 import jax
 import numpy as np
 import pytest
-from pretend import pretend_history, pretend_walk, tuning_of
-from test_experiments import script
+from pretend import instead, pretend_history, pretend_walk, tuning_of
 
 from hector_jax.control.parameters import bounds
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.robot.model import load_robot
-from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs, ideal
 from hector_jax.store import tunings
-from hector_jax.store.cache import content_key
 from hector_jax.store.folder import as_line
 from hector_jax.store.setup import Setup
 from hector_jax.store.tunings import Problem, Tuned
 from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.verdict import judging, metrics
+from hector_jax.verdict import judging
 
 ROBOT, CONFIG, S = load_robot(), TuneConfig(), named_command("s")
 POOL = ThreadPoolExecutor(1)  # never asked
@@ -44,7 +40,7 @@ def tuned(monkeypatch):
                 on_iteration(name, iteration)
             yield name, Tuned(TUNING, setup.commit)
 
-    monkeypatch.setattr(tunings, "_tunings", side_by_side)
+    instead(monkeypatch, tunings, "_tunings", side_by_side)
     return names
 
 
@@ -62,7 +58,7 @@ def walked(monkeypatch):
             yield pretend_walk(job.seed, float(job.weights.Q.euler[0]) / 1e4, 1.0, fall_at=fall_at)
 
     walks_of.cut = None
-    monkeypatch.setattr(judging, "walk_jobs", walks_of)
+    instead(monkeypatch, judging, "walk_jobs", walks_of)
     return seeds, walks_of
 
 
@@ -88,23 +84,6 @@ def test_a_tuning_comes_back_as_it_was(tmp_path, tuned):
         refused = [int(i.iteration) for i in back.iterations if i.reason]
         assert refused == [int(i.iteration) for i in back.iterations if not i.accepted] == [3, 5]
     assert tuned == ["without"]
-
-
-def test_a_tuning_from_weights_with_other_numbers_comes_back(tmp_path, monkeypatch):
-    made, start = [], nominal()._replace(others={"footstep_feedback": np.array(0.1)})
-    history = [
-        one._replace(weights=start, evaluation=one.evaluation._replace(gradient=start))
-        for one in TUNING.iterations
-    ]
-
-    def side_by_side(setup, start, problems, title, on_iteration):
-        made.append(title)
-        yield "without", Tuned(tuning_of(history, start), "")
-
-    monkeypatch.setattr(tunings, "_tunings", side_by_side)
-    for _ in range(2):  # as tuned, and as kept
-        same(tune(tmp_path, start=start).tuning.weights, start)
-    assert len(made) == 1
 
 
 def test_metrics_of_a_run_that_was_cut_are_those_of_an_uncut_one(tmp_path, tuned):
@@ -134,15 +113,6 @@ def test_a_tuning_is_made_once_and_again_for_other_settings(tmp_path, tuned):
     tune(tmp_path, command=named_command("c"))
     tune(tmp_path, start=expert())
     assert len(tuned) == 4
-
-
-def test_a_damaged_tuning_is_made_anew(tmp_path, tuned, capsys):
-    tune(tmp_path)
-    (path,) = tmp_path.glob("*.npz")
-    path.write_bytes(path.read_bytes()[:-100])
-    tune(tmp_path)
-    assert len(tuned) == 2
-    assert path.name in "".join(capsys.readouterr().err.split())
 
 
 def test_walks_that_are_kept_are_not_walked_again(tmp_path, walked):
@@ -194,7 +164,7 @@ def test_a_walk_with_an_unsolved_qp_is_said(tmp_path, monkeypatch, capsys, resid
             walk = pretend_walk(job.seed, 0.03, 1.0)
             yield walk._replace(residual=np.where(job.seed == 1, residual, walk.residual))
 
-    monkeypatch.setattr(judging, "walk_jobs", walks_of)
+    instead(monkeypatch, judging, "walk_jobs", walks_of)
     for _ in range(2):  # as walked, and as kept
         judge(tmp_path, {"mine": nominal()})
         said = " ".join(capsys.readouterr().err.split())
@@ -203,54 +173,3 @@ def test_a_walk_with_an_unsolved_qp_is_said(tmp_path, monkeypatch, capsys, resid
         )
     judge(tmp_path, {"mine": nominal()}, seeds=(0,))
     assert capsys.readouterr().err == ""
-
-
-CODE = ("tuning.difftune",)
-
-
-def test_the_digest_tells_settings_trees_and_seeds_apart():
-    found = {
-        content_key(CONFIG, ROBOT, nominal(), code=CODE),
-        content_key(CONFIG, ROBOT, expert(), code=CODE),
-        content_key(TuneConfig(iterations=20), ROBOT, nominal(), code=CODE),
-        content_key(CONFIG, ROBOT._replace(mass=np.asarray(13.0)), nominal(), code=CODE),
-        content_key(CONFIG, ROBOT, nominal(), None, code=CODE),
-    }
-    assert len(found) == 5
-
-
-def test_groups_of_walks_are_kept_one_by_one(tmp_path):
-    jobs = [Job(nominal(), S, hfs(), seed=seed) for seed in range(4)]
-    groups = {"a": jobs[:1], "b": jobs[1:]}
-    walked = []
-
-    def walk(asked):
-        for job in asked:
-            if job.seed in walk.bad:
-                raise KeyboardInterrupt
-            walked.append(job.seed)
-            yield pretend_walk(job.seed, 0.02, 1.0)
-
-    def scores(config=CONFIG):
-        return script("lib").walk_groups(
-            groups,
-            walk,
-            partial(metrics.score, config.loss),
-            like=metrics.score_like(0),
-            kind="test",
-            robot=ROBOT,
-            folder=tmp_path,
-            settings=(config,),
-        )
-
-    walk.bad = {2}
-    with pytest.raises(KeyboardInterrupt):
-        scores()
-    walk.bad = set()
-    found = scores()
-    assert walked == [0, 1, 1, 2, 3]  # the whole group is there, of the cut one nothing
-    assert found["b"].L.shape == (3,)
-    same(found, scores())
-    assert len(walked) == 5
-    scores(TuneConfig(iterations=20))
-    assert len(walked) == 9

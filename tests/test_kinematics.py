@@ -64,37 +64,6 @@ inverse_reverse = jax.jit(jax.jacrev(inverse_legs, argnums=1))
 # Feet from joints
 
 
-def test_foot_poses_are_those_of_mujoco(model, robot, random_joints):
-    for joints in random_joints:
-        data = pose(model, joints)
-        feet = foot_poses_jit(robot, joints)
-        for side, foot in enumerate(FOOT_POINTS):
-            site = data.site(foot)
-            np.testing.assert_allclose(feet.position[side], site.xpos, rtol=0, atol=1e-12)
-            np.testing.assert_allclose(
-                feet.rotation[side], site.xmat.reshape(3, 3), rtol=0, atol=1e-12
-            )
-
-
-def test_foot_jacobians_are_those_of_mujoco(model, robot, random_joints):
-    for joints in random_joints:
-        data = pose(model, joints)
-        J_v, J_w = foot_jacobians_jit(robot, joints)
-        for side, foot in enumerate(FOOT_POINTS):
-            full_v, full_w = np.zeros((3, 16)), np.zeros((3, 16))
-            mujoco.mj_jacSite(model, data, full_v, full_w, model.site(foot).id)
-            own = slice(6 + 5 * side, 11 + 5 * side)
-            np.testing.assert_allclose(J_v[side], full_v[:, own], rtol=0, atol=1e-12)
-            np.testing.assert_allclose(J_w[side], full_w[:, own], rtol=0, atol=1e-12)
-
-
-def test_foot_jacobian_is_the_derivative_of_the_foot_point(robot, random_joints):
-    derivative = jax.jit(jax.jacfwd(foot_poses, argnums=1))(robot, random_joints[0]).position
-    J_v, _ = foot_jacobians_jit(robot, random_joints[0])
-    np.testing.assert_allclose(derivative[0], np.hstack([J_v[0], np.zeros((3, 5))]), atol=1e-14)
-    np.testing.assert_allclose(derivative[1], np.hstack([np.zeros((3, 5)), J_v[1]]), atol=1e-14)
-
-
 def test_mirrored_joints_have_mirrored_feet(robot, random_joints):
     flip = jnp.array([-1.0, -1.0, 1.0, 1.0, 1.0])
     mirror = jnp.array([1.0, -1.0, 1.0])

@@ -1,6 +1,5 @@
 """The command line: its words become flags, or one line says which word is wrong."""
 
-import json
 import os
 import subprocess
 import sys
@@ -14,7 +13,7 @@ from hector_jax.cli import commands
 from hector_jax.cli.arguments import flag_folder
 from hector_jax.cli.flags import COMMANDS, Compare, Evaluate, Export, Tune, View, Walk
 from hector_jax.cli.main import main
-from hector_jax.cli.parse import as_table, check, from_line, resolve_latest
+from hector_jax.cli.parse import from_line, resolve_latest
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.model import load_robot
 
@@ -51,48 +50,20 @@ def test_flags_are_taken_in_any_order_and_spelling():
     ("line", "fault"),
     [
         ("wlak", "unknown command 'wlak'; did you mean 'walk'?"),
-        ("wlak --help", "unknown command 'wlak'; did you mean 'walk'?"),
         ("walk --wrold hfs", "walk has no flag '--wrold'; did you mean '--world'?"),
         ("walk --zzz", "walk has no flag '--zzz'; see hector walk --help"),
-        ("walk --no-seed", "walk has no flag '--no-seed'; did you mean '--seed'?"),
-        ("view a --run b", "view has no flag '--run'; see hector view --help"),
         ("walk there", "walk does not expect 'there'; see hector walk --help"),
-        ("walk --seed 1 2", "walk does not expect '2'; see hector walk --help"),
         ("walk --json yes", "walk does not expect 'yes'; see hector walk --help"),
-        ("walk --json=yes", "walk does not expect 'yes'; see hector walk --help"),
         ("walk --seed", "Missing value for argument '--seed'. Expected 1 values."),
         ("walk --seed 1 --seed 2", "--seed is given twice"),
-        ("tune --video --no-video", "--video is given twice"),
-        ("evaluate --weights", "--weights expects a value, got none"),
         ("evaluate --weights nominal nominal", "--weights names 'nominal' twice"),
-        ("evaluate --weights nominal --weights expert", "--weights is given twice"),
         ("view . --sets with", "Missing value for argument '--sets'. Expected 2 values."),
         ("view", "Missing from hector view: PATH folder of a run"),
-        (
-            "walk --seconds long",
-            "Error parsing --seconds: expected a number, got 'long'",
-        ),
-        (
-            "walk --world moon",
-            "invalid choice 'moon' for argument '--world'. Expected one of ('",
-        ),
-        (
-            "evaluate --world srbm",
-            "invalid choice 'srbm' for argument '--world'. Expected one of ('",
-        ),
-        ("tune --alpha both", "invalid choice 'both' for argument '--alpha'"),
-        (
-            "collect --engine warp",
-            "invalid choice 'warp' for argument '--engine'. Expected one of ('auto'",
-        ),
+        ("walk --seconds long", "Error parsing --seconds: expected a number, got 'long'"),
+        ("walk --world moon", "invalid choice 'moon' for argument '--world'. Expected one of ('"),
         ("walk --robot assets/hector.xml", "hector robot MODEL --out NAME.toml makes one, got"),
         (f"walk --weights {300 * 'x'}.json", "cannot read the file: File name too long"),
         (f"tune --resume {300 * 'x'}", "--resume must be the folder of a run of `hector tune`"),
-        ("walk --weights exprt", "weights file, got 'exprt'; did you mean 'expert'?"),
-        (
-            "tune --seeds 3.5",
-            "Error parsing --seeds: expected a whole number, got '3.5'",
-        ),
     ],
 )
 def test_a_wrong_word_is_one_line_with_the_nearest_name(monkeypatch, capsys, line, fault):
@@ -119,31 +90,16 @@ def test_every_number_has_an_upper_bound_that_is_told(monkeypatch, capsys, kind,
     assert f"from {rule.low} to {rule.high}, got 1000000000000" in line
 
 
-def test_the_last_seed_may_not_pass_the_largest(monkeypatch, capsys):
-    largest = 2**32 - 1
-    line = refused(monkeypatch, capsys, "evaluate", "--first-seed", largest, "--seeds", 2)
-    assert "--first-seed 4294967295 and --seeds 2 reach beyond the largest seed" in line
-    check(Evaluate(first_seed=largest, seeds=1))
-
-
 @pytest.mark.parametrize(
     ("make", "fault"),
     [
         (lambda path: None, "No such file or directory"),
-        (lambda path: path.mkdir(), "not a plain file"),
-        (lambda path: path.symlink_to(path), "Too many levels of symbolic links"),
         (lambda path: os.mkfifo(path), "not a plain file"),
     ],
-    ids=["missing", "folder", "loop", "pipe"],
+    ids=["missing", "pipe"],
 )
 @pytest.mark.parametrize(
-    ("words", "name"),
-    [
-        (["walk", "--weights"], "own.json"),
-        (["walk", "--traj"], "own.toml"),
-        (["walk", "--robot"], "own.toml"),
-        (["report", "runs"], "own.npz"),
-    ],
+    ("words", "name"), [(["walk", "--weights"], "own.json"), (["report", "runs"], "own.npz")]
 )
 def test_a_file_that_cannot_be_read_is_told_before_anything_is_loaded(
     tmp_path, make, fault, words, name
@@ -189,35 +145,13 @@ def test_latest_is_the_newest_run(monkeypatch, tmp_path):
     assert resolve_latest(from_line(["view", "latest"])).run == Path("latest")
 
 
-def test_latest_without_a_run_is_refused(monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match="latest: there is no run in the folder `runs`"):
-        resolve_latest(from_line(["view", "latest"]))
-
-
-def test_help_shows_no_python(monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", "120")
-    for kind in COMMANDS.values():
-        monkeypatch.setattr(sys, "argv", ["hector", kind.__name__.lower(), "--help"])
-        with pytest.raises(SystemExit) as left:
-            main()
-        assert left.value.code == 0
-        shown = capsys.readouterr().out
-        assert "None" not in shown
-        assert "{None}" not in shown
-
-
 SLALOM = Path(__file__).parents[1] / "examples" / "slalom.toml"
 STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
 
 
-@pytest.mark.parametrize(
-    "words", [["walk"], ["evaluate"], ["verdict", "--weights", "nominal", "expert"]]
-)
-@pytest.mark.parametrize("given", [4, 5])
-def test_a_given_length_is_refused_where_the_trajectory_has_one(words, given):
-    args = from_line([*words, "--traj", str(SLALOM), "--seconds", str(given)])
-    with pytest.raises(InputError, match=f"slalom lasts 6 s, as its file says, got {given}"):
+def test_a_given_length_is_refused_where_the_trajectory_has_one():
+    args = from_line(["walk", "--traj", str(SLALOM), "--seconds", "4"])
+    with pytest.raises(InputError, match="slalom lasts 6 s, as its file says, got 4"):
         commands.run(args)
 
 
@@ -245,14 +179,6 @@ def test_what_was_given_is_noted_through_files_and_latest(tmp_path, monkeypatch)
     assert args.given == {"config", "first_seed", "seeds"}
     assert args.is_given("first_seed")
     assert not args.is_given("world")
-
-
-def test_a_default_that_a_run_recorded_was_not_given(tmp_path):
-    config = tmp_path / "config.json"
-    config.write_text(json.dumps({"flags": as_table(Tune(iterations=20))}))
-    args = from_line(["tune", "--config", str(config)])
-    assert args.is_given("iterations")
-    assert not args.is_given("seeds")
 
 
 # Names that are not text

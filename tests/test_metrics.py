@@ -115,12 +115,6 @@ def test_an_interval_over_trajectories_covers_as_one_over_plants_does(monkeypatc
     assert found > pooled + 0.1
 
 
-def test_three_plants_have_no_interval_on_however_many_trajectories():
-    verdict = _judge("abcd", nominal=[1.0, 2.0, 3.0], tuned=[0.5, 0.8, 1.8])
-    assert np.isnan(metrics.compare(verdict, "tuned", "nominal").change["L"][1:]).all()
-    assert np.isnan(metrics.mean(verdict, "tuned")[1:]).all()
-
-
 def test_the_seeds_of_a_result_are_its_plants_and_its_falls_and_wins_are_walks():
     verdict = pretend_verdict(4, {("with", 1)}, scenes=("straight", "c", "s"))
     assert verdict.walks == 12
@@ -133,14 +127,8 @@ def test_the_seeds_of_a_result_are_its_plants_and_its_falls_and_wins_are_walks()
     assert np.shape(verdict.scores["with"].L) == (4, 3)
 
 
-def test_wins_are_counted_by_walk():
-    verdict = _judge(nominal=[1.0, 1.0, 1.0, 1.0], tuned=[0.5, 0.9, 1.1, 1.0])
-    assert metrics.compare(verdict, "tuned", "nominal").wins == 0.5
-
-
 @pytest.mark.parametrize(
-    ("seeds", "fell", "counts"),
-    [(32, 0, True), (32, 1, True), (32, 2, False), (8, 0, True), (8, 1, False), (64, 3, True)],
+    ("seeds", "fell", "counts"), [(32, 1, True), (32, 2, False), (8, 1, False), (64, 3, True)]
 )
 def test_a_comparison_counts_only_where_falls_differ_by_less_than_2_of_32(seeds, fell, counts):
     verdict = pretend_verdict(seeds, {("with", i) for i in range(fell)})
@@ -181,17 +169,6 @@ def test_legs_that_touch_are_counted_up_to_a_fall():
     assert metrics.verdict_result(verdict)["sets"]["with"]["standin"][
         "legs_touch"
     ] == pytest.approx(1.0)
-
-
-def test_the_result_of_a_set_that_falls_at_once_is_still_json():
-    walk = metrics.score(PAPER_LOSS, pretend_walk(fall_at=-1.0))
-    scores = {"s": {"nominal": [walk] * 2, "with": [walk] * 2}}
-    verdict = metrics.make_verdict(PAPER_LOSS, [0, 1], scores)
-    found = metrics.verdict_result(verdict)["sets"]["with"]["standin"]
-    found = json.loads(as_json(found))
-    assert found["falls"] == 2
-    assert found["rms"]["position"] == [None] * 3
-    assert found["change"]["nominal"]["median"] == pytest.approx(0.0)
 
 
 def test_a_missing_walk_or_a_loss_that_is_not_a_number_is_refused():

@@ -21,14 +21,7 @@ from hector_jax.control.contact import (
     StateConstraint,
 )
 from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
-from hector_jax.control.mpc import (
-    Horizon,
-    MpcConfig,
-    MpcProblem,
-    build_qp,
-    half_slope,
-    solve_mpc,
-)
+from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, build_qp, half_slope, solve_mpc
 from hector_jax.control.parameters import bounds
 from hector_jax.control.weights import (
     Weights,
@@ -44,7 +37,6 @@ from hector_jax.core.trajectory import State, Wrench, pack_wrench, unpack_wrench
 from hector_jax.qp import QP, Status, solve_qp
 from hector_jax.robot import srbm
 from hector_jax.robot.model import load_robot
-from hector_jax.store.cache import content_key
 
 ROBOT = load_robot()
 CONFIG = MpcConfig()
@@ -552,26 +544,3 @@ def test_u_is_packed_forces_first():
     wrench = unpack_wrench(condensed.inputs[0] @ jnp.array([1.0, 2.0, 3.0, 0.0, 5.0]))
     np.testing.assert_allclose(wrench.force, [[1, 2, 3], [0, 0, 0]])
     np.testing.assert_allclose(wrench.moment, [[0, 0, 5], [0, 0, 0]])
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"horizon": 0}, {"step_ticks": 0}, {"effort_reference": "something"}]
-)
-def test_impossible_problems_are_refused(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        MpcConfig(**wrong)
-
-
-def test_two_parts_of_one_name_have_keys_of_their_own():
-    def twist(contact):
-        return Rows(contact.moment[2:], -2.0, 2.0)
-
-    def turn(contact):
-        return Rows(contact.moment[2:], -1.0, 1.0)
-
-    one, other = (InputConstraint("twist", of=of) for of in (twist, turn))
-    assert (str(one), one == other, f"{one}") == ("twist", False, "twist")
-    configs = [MpcConfig(constraints=(*CONFIG.constraints, part)) for part in (one, other)]
-    assert repr(configs[0]) != repr(configs[1])
-    assert content_key(configs[0], code=()) != content_key(configs[1], code=())
-    assert json.dumps(asdict(configs[0])["constraints"][-1]) == '"twist"'

@@ -11,11 +11,7 @@ from lib import sample_weights
 from model import ROBOT, SHORT, small_effect
 
 from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.weights import (
-    nominal,
-    vector_to_weights,
-    weights_to_vector,
-)
+from hector_jax.control.weights import nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.trajectory import State
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot

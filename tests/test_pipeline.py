@@ -1,38 +1,30 @@
 """A net is reused only for its own walks and controller; a loss is one number on either engine."""
 
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-import table
-from model import LEARNS_TOUCHDOWNS
-from pretend import pretend_walk
+from pretend import instead
 from synthetic import synthetic_walk
 
-from hector_jax.cli import commands, flags
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import (
-    directions,
     expert,
     nominal,
-    vector_to_weights,
-    weights_to_vector,
 )
-from hector_jax.core import environment
 from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import read_card
 from hector_jax.grfm import dataset
 from hector_jax.grfm.collection import collect
 from hector_jax.grfm.jobs import draw_jobs
-from hector_jax.grfm.paper import PaperParams
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import load_robot
-from hector_jax.sim.engine import ENGINES, MUJOCO_C
+from hector_jax.sim.engine import ENGINES
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
@@ -40,8 +32,8 @@ from hector_jax.store import nets, tunings
 from hector_jax.store.nets import CollectConfig
 from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.evaluate import Evaluation, mean_objective
-from hector_jax.tuning.rollout import RolloutConfig, Scenario
+from hector_jax.tuning.evaluate import Evaluation
+from hector_jax.tuning.rollout import RolloutConfig
 from hector_jax.verdict.metrics import score
 from hector_jax.walk_tuning import searches
 
@@ -90,18 +82,6 @@ def test_no_walk_is_in_two_parts(tmp_path, robot):
     assert set(np.asarray(held.job.seed)) == walks[2]
 
 
-def test_a_net_that_learns_no_touchdowns_says_so_where_they_are_asked_for(tmp_path, capsys):
-    def walks(jobs):
-        return (synthetic_walk(job.seed, 45) for job in jobs)
-
-    collect(tmp_path, draw_jobs(0, 5), walks, robot=LEARNS_TOUCHDOWNS)
-    for variant, says in (("linear", 1), ("gated", 0)):
-        config, path = TrainConfig(variant), tmp_path / f"{variant}.npz"
-        nets.train_net(config, LEARNS_TOUCHDOWNS, tmp_path, path)
-        line = f"tuning.touchdown_error: the net {variant} does not learn where the feet land"
-        assert capsys.readouterr().err.count(line) == says
-
-
 def test_a_net_is_trained_once(tmp_path, robot, quick, monkeypatch):
     gather(tmp_path / "walks", robot)
     first = ground(tmp_path, robot)
@@ -118,27 +98,6 @@ def test_a_net_is_trained_once(tmp_path, robot, quick, monkeypatch):
     assert card["made_of"]["controller"] == repr(WalkConfig())
 
 
-def test_data_follow_from_their_own_settings_whatever_command_makes_them(tmp_path, monkeypatch):
-    made, cut = [], InterruptedError
-
-    def collect(pool, config, robot, folder):
-        made.append((config, folder))
-        raise cut
-
-    monkeypatch.setattr(nets, "collect_walks", collect)
-    monkeypatch.setattr(tunings, "compile_programs", lambda *args, **options: [])  # it walks
-    for command in (
-        flags.Tune(iterations=10, data=tmp_path / "data", out=tmp_path / "run"),
-        flags.Grfm(data=tmp_path / "data", out=tmp_path / "grfm"),
-    ):
-        with pytest.raises(cut):
-            commands.run(command)
-    asked = table.Flags(quick=True, data=tmp_path / "data", out=tmp_path / "table")
-    with pytest.raises(cut):
-        table.make_table(asked, lambda seeds: [])
-    assert made == 3 * [(CollectConfig(), tmp_path / "data" / "walks")]
-
-
 @pytest.mark.parametrize(
     ("others", "message"),
     [
@@ -146,10 +105,7 @@ def test_data_follow_from_their_own_settings_whatever_command_makes_them(tmp_pat
             {"seed": 5},
             "walks: made with seed 5, this command expects 0; remove it, or name another",
         ),
-        ({"walks": 128}, "walks: made with walks 128, this command expects 64"),
         ({"paths": "short"}, "walks: made with paths 'short', this command expects"),
-        ({"controller": "another"}, "walks: made with controller 'another'"),
-        ({"robot": "b", "controller": "another"}, "walks: made for another robot of this name"),
         ({"code": "older"}, "walks: made by other code or other versions of jax, jaxlib, mujoco"),
     ],
 )
@@ -173,70 +129,6 @@ def test_a_net_of_other_settings_or_other_walks_is_refused_and_stays(tmp_path, r
         ground(tmp_path, robot)
 
 
-def test_a_net_of_another_variant_is_refused_and_kept(tmp_path, robot):
-    gather(tmp_path / "walks", robot)
-    path = tmp_path / "grfm.npz"
-    nets.train_net(TrainConfig("paper", epochs=1), robot, tmp_path / "walks", path)
-    written = path.read_bytes()
-    with pytest.raises(InputError, match="grfm.npz: holds grfm-paper, expected grfm-residual"):
-        ground(tmp_path, robot)
-    assert path.read_bytes() == written
-
-
-def test_a_net_is_stored_by_its_variant(tmp_path, robot, quick, monkeypatch):
-    assert nets.net_path(tmp_path, "residual") == tmp_path / "grfm.npz"
-    path = nets.net_path(tmp_path, "paper")
-    assert path == tmp_path / "grfm-paper.npz"
-    gather(tmp_path / "walks", robot)
-    nets.train_net(TrainConfig("paper", epochs=1), robot, tmp_path / "walks", path)
-    monkeypatch.setattr(nets, "_train", None)  # nothing is to be trained again
-    assert isinstance(ground(tmp_path, robot, "paper").params, PaperParams)
-
-
-SHARED = directions() @ directions().T  # curvature of |log(theta)|^2 / 2 in the log-steps
-
-
-def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, monkeypatch):
-    """Quadratics of the log-weights, of very different size."""
-    sizes = {"c": 1.0, "s": 1e3}
-    commands = [named_command(name)._replace(duration=np.array([k])) for name, k in sizes.items()]
-
-    def tune_step(config, scenario, weights):
-        vector = np.asarray(weights_to_vector(weights))
-        (size,) = scenario.command.duration
-        logs = np.log(vector) - (1.0 if size > 1.0 else -1.0)
-        gradient = vector_to_weights(jnp.asarray(2.0 * size * logs / vector))
-        loss = np.array(size * (logs @ logs))
-        terms = dict.fromkeys(("L_Eul", "L_pos", "L_ctrl"), loss)
-        return Evaluation(loss, terms, gradient, np.array(0.0), np.array(0.0))
-
-    def matrix(config, scenario, weights, loss, *, others):
-        return 2.0 * float(scenario.command.duration[0]) * SHARED
-
-    monkeypatch.setattr(tunings.difftune, "tune_step", tune_step)
-    monkeypatch.setattr(tunings.difftune, "gauss_newton_jit", matrix)
-    config = TuneConfig(iterations=12)
-    setup = Setup(ThreadPoolExecutor(2), config, robot)
-    for others in ((), (commands[1],)):
-        problem = tunings.Problem((commands[0], *others), None)
-        found = tunings._tune_on_cpu(setup, nominal(), problem, lambda iteration: None)
-        first = found.iterations[0].evaluation
-        scenarios = [Scenario(robot, c, None, None) for c in (commands[0], *others)]
-        each = [tune_step(config, scenario, nominal()) for scenario in scenarios]
-        mean = np.mean([one.loss for one in each])
-        assert first.loss == pytest.approx(mean, rel=1e-12)
-        scales = [one.loss / mean for one in each]
-        for i, gradient in enumerate(jax.tree.leaves(first.gradient)):
-            parts = [jax.tree.leaves(e.gradient)[i] / k for e, k in zip(each, scales, strict=True)]
-            np.testing.assert_allclose(gradient, np.mean(parts, axis=0), rtol=1e-12)
-        assert found.loss < first.loss
-        curved = [*sizes.values()][: len(scales)] / np.array(scales if others else [1.0])
-        expected = 2.0 * curved.mean() * SHARED / first.loss + config.ridge * np.eye(18)
-        np.testing.assert_allclose(found.precision, expected, rtol=1e-12)
-        if not others:  # a single one to the last bit
-            jax.tree.map(np.testing.assert_array_equal, first, each[0])
-
-
 @pytest.mark.parametrize("falls", [{1}, {0, 1, 2}])
 def test_drawn_models_with_which_the_start_falls_are_left_out(robot, monkeypatch, capsys, falls):
     def tune_step(config, scenario, weights):
@@ -244,7 +136,7 @@ def test_drawn_models_with_which_the_start_falls_are_left_out(robot, monkeypatch
         loss, fallen = np.array(1.0 + seed), np.array(float(seed in falls))
         return Evaluation(loss, {}, nominal(), fallen, np.array(0.0))
 
-    monkeypatch.setattr(tunings.difftune, "tune_step", tune_step)
+    instead(monkeypatch, tunings.difftune, "tune_step", tune_step)
     setup = Setup(ThreadPoolExecutor(2), TuneConfig(), robot)
     problem = tunings.Problem((named_command("s"),), None, 3)
     found = tunings._objective(setup, nominal(), problem).evaluate(nominal())
@@ -257,43 +149,23 @@ def test_drawn_models_with_which_the_start_falls_are_left_out(robot, monkeypatch
         assert (found.fallen, said) == (1.0, "")
 
 
-def test_what_takes_the_mean_over_commands_is_in_the_key_of_a_tuning():
-    source = environment._source("tuning.difftune").read_bytes()
-    modules = {*tunings.TUNING_CODE, *environment._syntax(source)[1]}
-    assert mean_objective.__module__.removeprefix("hector_jax.") in modules
-
-
 def test_a_tuning_that_fails_is_told_while_others_go_on(tmp_path, monkeypatch, robot):
+    told = threading.Event()
+
     def tune(setup, start, problem, put):
         if problem.commands is falls:
             raise InputError("the starting weights fall")
-        time.sleep(20.0)
+        told.wait(60.0)
 
-    monkeypatch.setattr(tunings, "_tune_on_cpu", tune)
+    instead(monkeypatch, tunings, "_tune_on_cpu", tune)
     falls, walks = (named_command("s"),), (named_command("c"),)
     problems = {"without": tunings.Problem(walks, None), "with": tunings.Problem(falls, None)}
     begin, pool = time.monotonic(), ThreadPoolExecutor(2)
     with pytest.raises(InputError, match="the starting weights fall"):
         tunings.tune_all(Setup(pool, TuneConfig(), robot), problems, tmp_path, title="tuning")
-    assert time.monotonic() - begin < 15.0
-    pool.shutdown(wait=False)
-
-
-def test_a_search_says_which_walks_had_an_unsolved_qp(robot, capsys):
-    def toys(pool, config, robot, jobs, **options):
-        for job in jobs:
-            walk = pretend_walk(0, 0.03, 1.0)
-            wrong = float(job.weights.Q.euler[0]) == float(expert().Q.euler[0])
-            yield walk._replace(residual=np.full_like(walk.residual, np.nan if wrong else 0.0))
-
-    sets = {"c": [nominal(), expert()], "s": [nominal()]}
-    commands = {name: named_command(name) for name in sets}
-    engine = MUJOCO_C._replace(walk=toys)
-    pool = ThreadPoolExecutor(1)
-    setup = Setup(pool, TuneConfig(), robot)
-    searches.losses_on_hfs(setup, sets, commands=commands, engine=engine, at_once=3)
-    said = " ".join(capsys.readouterr().err.split())
-    assert said == "c: a QP was not solved in 1 of 2 walks"
+    assert time.monotonic() - begin < 30.0
+    told.set()
+    pool.shutdown()
 
 
 @pytest.mark.slow

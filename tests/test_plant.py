@@ -1,6 +1,5 @@
 """Another model of the robot as the plant: the controller keeps its own numbers."""
 
-import json
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -9,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pretend import pretend_walk
+from pretend import instead, pretend_walk
 
 from hector_jax.cli import arguments
 from hector_jax.cli.main import main
@@ -17,11 +16,8 @@ from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.inputs import InputError
-from hector_jax.core.tree_file import read_card
 from hector_jax.robot.description import PlantSizes
 from hector_jax.robot.model import load_robot
-from hector_jax.sim import parallel
-from hector_jax.sim import walk as sim_walk
 from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.parallel import walk_batch
@@ -67,31 +63,6 @@ def test_the_world_is_the_plants_model_and_it_stands_in_its_own_pose(arms):
     assert not walked.fallen.any()
 
 
-def test_mjx_builds_the_same_world(monkeypatch, arms):
-    built = {}
-
-    class BuiltError(Exception):
-        """Nothing is walked here."""
-
-    def build(imperfections, description):
-        built["model"] = description.model
-        return parallel_build(imperfections, description)
-
-    def stand(world, joints, height):
-        built["stands"] = joints, height
-        raise BuiltError
-
-    parallel_build = parallel.build_worlds
-    monkeypatch.setattr(parallel, "build_worlds", build)
-    monkeypatch.setattr(parallel, "standing_qpos", stand)
-    job = Job(expert(), STRAIGHT, ideal(), 0.1, plant=arms)
-    with pytest.raises(BuiltError):
-        walk_batch(CONFIG, ROBOT, [job, job])
-    assert built["model"] == arms.description.model
-    np.testing.assert_array_equal(built["stands"][0], arms.standing_joints)
-    assert built["stands"][1] == arms.trunk_height
-
-
 @pytest.mark.slow
 def test_both_engines_walk_the_plant_alike():
     plant = load_robot(ARMS.with_name("robot.toml"))
@@ -99,12 +70,6 @@ def test_both_engines_walk_the_plant_alike():
     (batched,) = walk_batch(CONFIG, ROBOT, [job], fine=True)
     alone = walk(CONFIG, ROBOT, job)
     np.testing.assert_allclose(batched.state.position, alone.state.position, atol=1e-3)
-
-
-def test_a_batch_is_of_one_model(arms):
-    jobs = [Job(expert(), STRAIGHT, ideal(), 0.1, plant=plant) for plant in (None, arms)]
-    with pytest.raises(ValueError, match="on plants of one model"):
-        walk_batch(CONFIG, ROBOT, jobs)
 
 
 @pytest.mark.parametrize("engine", [walk, lambda *known: walk_batch(*known[:2], [known[2]])])
@@ -118,8 +83,11 @@ def test_a_plant_of_other_joints_is_refused(engine):
 
 
 def test_scores_of_another_plant_are_others(monkeypatch, tmp_path, arms):
-    monkeypatch.setattr(
-        judging, "walk_jobs", lambda *known: (pretend_walk(job.seed) for job in known[1])
+    instead(
+        monkeypatch,
+        judging,
+        "walk_jobs",
+        lambda *known: (pretend_walk(job.seed) for job in known[1]),
     )
     known = {"nominal": nominal()}, STRAIGHT, [hfs()], [0]
     # another file with the very same numbers
@@ -129,33 +97,6 @@ def test_scores_of_another_plant_are_others(monkeypatch, tmp_path, arms):
             setup = Setup(pool, TuneConfig(), ROBOT)
             judging.judge(setup, *known, title="", folder=tmp_path, plant=plant)
     assert len(list(tmp_path.glob("*.npz"))) == 3
-
-
-def test_the_command_line_takes_the_plant_and_names_it(monkeypatch, capsys, tmp_path):
-    jobs = []
-
-    def walks_of(setup, asked, title, engine):
-        for job in asked:
-            jobs.append((setup.robot, job))
-            yield pretend_walk(job.seed)
-
-    def walk_one(config, robot, job, **others):
-        jobs.append((robot, job))
-        return pretend_walk()
-
-    monkeypatch.setattr(judging, "walk_jobs", walks_of)
-    monkeypatch.setattr(sim_walk, "walk", walk_one)
-    words = ["evaluate", "--plant", ARMS, "--world", "hfs", "--out", tmp_path / "result.json"]
-    assert call(monkeypatch, *words) == 0
-    assert "straight, 1 plant of hector-v2-arms on the hfs" in capsys.readouterr().out
-    assert json.loads((tmp_path / "result.json").read_text())["plant"] == "hector-v2-arms"
-    assert call(monkeypatch, "walk", "--plant", ARMS, "--out", tmp_path / "walk.npz") == 0
-    assert "straight in hfs on hector-v2-arms, nominal" in capsys.readouterr().out
-    assert read_card(tmp_path / "walk.npz")["about"]["plant"] == str(ARMS)
-    assert len(jobs) == 3
-    for robot, job in jobs:
-        assert robot.description.name == "hector"
-        assert job.plant.description.name == "hector-v2-arms"
 
 
 def test_a_plant_has_its_own_sizes(monkeypatch, arms):
@@ -173,7 +114,6 @@ def test_a_plant_has_its_own_sizes(monkeypatch, arms):
     [
         (["walk", "--plant", ARMS, "--world", "srbm"], "--plant needs a world of MuJoCo"),
         (["walk", "--plant", STRIDER], "as a plant of"),
-        (["evaluate", "--plant", STRIDER], "as a plant of"),
     ],
 )
 def test_what_cannot_be_a_plant_is_one_line(monkeypatch, capsys, words, message):

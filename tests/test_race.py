@@ -5,19 +5,9 @@ from importlib.util import find_spec
 import jax
 import numpy as np
 import pytest
-import race
-from model import AHEAD, BRIEF
 from rivals import RIVALS, Spent, Task
 
-from hector_jax.control.weights import expert, nominal
-from hector_jax.core.inputs import InputError
-from hector_jax.core.trajectory import no_samples
 from hector_jax.robot.model import load_robot
-from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.walk_tuning import walks
-from hector_jax.walk_tuning.campaign import Campaign, box_of, weights_at
-from hector_jax.walk_tuning.walk_log import LogScore, log_of
 
 SIZE = 6
 GOAL = np.linspace(-1.0, 1.0, SIZE)
@@ -56,149 +46,6 @@ def test_a_rival_goes_downhill_within_its_box_and_repeats_itself(name):
     np.testing.assert_array_equal(walked_by(name, budget=20)[0], points[:20])
 
 
-@pytest.mark.parametrize("name", sorted(RIVALS.keys() - {"differences"}))
-def test_another_seed_gives_other_points(name):
-    one, other = (walked_by(name, seed, budget=20)[0] for seed in (1, 2))
-    assert np.abs(one - other).max() > 0.1
-
-
-def test_the_model_is_worth_walks():
-    cold, warm = (walked_by(name, budget=30)[1].min() for name in ("cma-es", "warm cma-es"))
-    assert warm < cold
-
-
-def test_differences_halve_a_step_that_raises_the_loss():
-    points, losses = walked_by("differences", budget=SIZE + 4, loss=lambda x: bowl(20.0 * x))
-    np.testing.assert_allclose(points[1 : SIZE + 1], np.log(1.05) * np.eye(SIZE))
-    lengths = np.linalg.norm(points[SIZE + 1 :], axis=1)
-    assert losses[SIZE + 1] > losses[0]
-    np.testing.assert_allclose(lengths[1:] / lengths[:-1], 0.5)
-
-
-def test_what_the_model_tells_is_of_its_search(robot, tmp_path, monkeypatch):
-    config = TuneConfig(rollout=BRIEF)
-    campaign = Campaign(tmp_path, config, robot, nominal(), {"short": AHEAD}, [hfs()])
-    monkeypatch.setattr(walks, "campaign_space", lambda pool, campaign: campaign.folder)
-
-    def folder():
-        return race.read_model(None, campaign, searches=False).space
-
-    before, again = folder(), folder()
-    monkeypatch.setattr(race, "_model_loss", lambda *inputs: 1.0)
-    assert before == again != folder()
-
-
 @pytest.fixture(scope="module")
 def robot():
     return jax.tree.map(np.asarray, load_robot())
-
-
-@pytest.fixture
-def bowl_walks(monkeypatch, robot):
-    """Walk on a bowl: L falls towards the expert's weights."""
-    made, log = [], log_of(no_samples(len(robot.joint_lower), len(robot.foot_point)))
-
-    def walk_case(campaign, weights, case):
-        made.append(weights)
-        steps = [np.log(a / b) for a, b in zip(weights.Q, expert().Q, strict=True)]
-        score = LogScore(1.0 + float(np.sum(np.square(steps))), 0.1)
-        return score, log
-
-    monkeypatch.setattr(walks, "walk_case", walk_case)
-    monkeypatch.setattr(walks, "save_tree", lambda *args, **options: None)
-    return made
-
-
-def contest(folder, robot, method, seed=0):
-    entry = race.Contest("short", "nominal", method, seed)
-    inputs = folder, TuneConfig(rollout=BRIEF), robot, nominal(robot), {"short": AHEAD}, [hfs()]
-    campaign = Campaign(*inputs, seed=seed, **race.OURS.get(method, {}))
-    size = len(box_of(campaign))
-    rng = np.random.default_rng(0)
-    space = race.few_walks.space_of(np.eye(size), box_of(campaign))
-    return campaign, entry, race.Model(space, rng.normal(size=(50, size)), rng.random(50))
-
-
-@pytest.mark.parametrize("method", ["cma-es", "random in metric", "no gradients"])
-def test_a_contest_that_was_cut_ends_as_if_it_had_not_been(robot, bowl_walks, tmp_path, method):
-    one = contest(tmp_path / "one", robot, method)
-    race.contest_job(*one, 12)
-    count = one[1].rows_after(12)
-    assert count == 12 + (method != "no gradients")
-    assert len(bowl_walks) == count
-    whole = (tmp_path / "one" / "walks.jsonl").read_bytes()
-    other = contest(tmp_path / "other", robot, method)
-    race.contest_job(*other, 5)
-    race.contest_job(*other, 12)
-    assert len(bowl_walks) == 2 * count  # none twice
-    assert (tmp_path / "other" / "walks.jsonl").read_bytes() == whole
-
-
-def test_the_best_set_is_the_least_and_a_fall_is_worse_than_all(robot, bowl_walks, tmp_path):
-    campaign, entry, model = contest(tmp_path, robot, "random")
-    race.contest_job(campaign, entry, model, 20)
-    rows = walks.read_history(campaign)
-    best = race.best_of(campaign, entry, model, rows[:11])
-    assert best.loss == min(row.losses[0] for row in rows[:11])
-    expected = weights_at(campaign, model.space, rows[best.number].point)
-    np.testing.assert_array_equal(best.weights.Q.position, expected.Q.position)
-    row = walks.Row(rows[0].point, "random", None, np.array([np.inf]), 1.0)
-    log_losses = race._log_losses([*rows, row])
-    assert log_losses[0] == 0.0
-    assert log_losses[-1] == pytest.approx(max(log_losses[:-1]) + 1.0)
-
-
-def test_walks_of_another_rival_are_refused(robot, bowl_walks, tmp_path):
-    race.contest_job(*contest(tmp_path, robot, "random"), 3)
-    campaign, _, model = contest(tmp_path, robot, "random")
-    with pytest.raises(InputError, match="walk 1 was another"):
-        race.contest_job(campaign, race.Contest("short", "nominal", "cma-es", 0), model, 5)
-
-
-@pytest.mark.parametrize(
-    ("flags", "fault"),
-    [
-        ({"methods": ("bayes",)}, "Flags.methods must be of walks, .*, got 'bayes'"),
-        ({"engine": "mjx"}, "Flags.engine must be of c, drake, pinocchio, got 'mjx'"),
-        ({"start": ("a/best.json", "b/best.json")}, "Flags.start must be nominal, or files of"),
-        ({"start": ("a/nominal.json",)}, "Flags.start must be nominal, or files of"),
-        ({"plants": -1}, "Flags.plants must"),
-    ],
-)
-def test_wrong_flags_are_refused_in_one_line(flags, fault):
-    with pytest.raises(InputError, match=fault):
-        race.Flags(**flags)
-
-
-def test_a_lead_is_paired_and_charges_the_net():
-    def at(*rows):
-        return dict(zip((0, 36, 100), map(list, rows), strict=True))
-
-    losses = {
-        race.Entry("tuned", "walks"): at((2.0, 2.0), (1.5, 1.5), (1.0, 1.1)),
-        race.Entry("tuned", "cma-es"): at((2.0, 2.0), (1.4, 1.4), (1.25, 1.375)),
-        race.Entry("nominal", "random"): at((6.0, 6.0), (5.0, 5.0), (3.0, 3.0)),
-    }
-    ours = next(iter(losses))
-    found = race.lead(losses, ours, 100)
-    assert found.rival == race.Entry("tuned", "cma-es")
-    np.testing.assert_allclose(found[1:], 0.8)
-    charged = race.lead(losses, ours, 100, charge=64)
-    assert charged.rival == race.Entry("nominal", "random")
-    np.testing.assert_allclose(charged[1:], 0.5)
-
-
-def test_the_report_has_every_method_and_budget(tmp_path):
-    flags = race.Flags(methods=("walks", "cma-es"), walks=10, repeats=2, out=tmp_path)
-    rows = [race.Contest("s", "nominal", m, i) for m in flags.methods for i in range(2)]
-    bests = {
-        (row, budget): race.Best(budget, nominal(), 1e6 * (6.0 - 0.1 * budget + row.seed))
-        for row in rows
-        for budget in (0, 1, 5, 10)
-    }
-    judged = {key: 2.0 * best.loss for key, best in bests.items()}
-    path = race.report(flags, bests, judged, dict.fromkeys(rows, 3))
-    text = path.read_text()
-    assert "| nominal | walks | 2 | 6.500 | 6.400 | 6.000 | 5.500 | 3.0 |" in text
-    assert text.count("1.00 [1.00, 1.00] cma-es") == 8
-    assert (tmp_path / "s.png").exists()

@@ -4,23 +4,21 @@ The logs are drawn, not walked: what is tried here is what the folder makes of t
 """
 
 import json
-import sys
 from contextlib import nullcontext, suppress
 from dataclasses import replace
-from functools import partial
 from itertools import product
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+from pretend import instead
 from test_walks import HandsOver
 
-from hector_jax.cli import evaluate, parse, propose
+from hector_jax.cli import evaluate, propose
 from hector_jax.cli.flags import Propose, Report, Walk
-from hector_jax.cli.main import main
 from hector_jax.control.trajectories import load_command
-from hector_jax.control.weights import expert, nominal
+from hector_jax.control.weights import nominal
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, no_samples
@@ -28,7 +26,6 @@ from hector_jax.core.tree_file import save_tree
 from hector_jax.robot.model import load_robot
 from hector_jax.search.few_walks import Proposal
 from hector_jax.tuning.loss import loss_of_robot
-from hector_jax.walk_tuning import campaign as campaigns
 from hector_jax.walk_tuning import reported_walks, walk_log, walks
 
 SECONDS = 0.1
@@ -59,9 +56,9 @@ def folder(monkeypatch, robot, tmp_path):
     """A folder for reports of three trajectories, in which nothing is computed for a proposal."""
     pool = HandsOver()
     monkeypatch.setattr(propose, "workers", lambda processes: nullcontext(pool))
-    monkeypatch.setattr(walks.few_walks, "propose", proposed)
-    monkeypatch.setattr(walks.few_walks, "needs_model", lambda *_: False)
-    monkeypatch.setattr(walks.few_walks, "incumbent", lambda _, h: walks.few_walks.best_walk(h))
+    instead(monkeypatch, walks.few_walks, "propose", proposed)
+    instead(monkeypatch, walks.few_walks, "needs_model", lambda *_: False)
+    instead(monkeypatch, walks.few_walks, "incumbent", lambda _, h: walks.few_walks.best_walk(h))
     monkeypatch.setattr(propose.arguments, "beyond", lambda *_: "")  # takes a quarter of a second
     monkeypatch.setattr(propose.arguments, "limits", lambda *_: None)
     monkeypatch.chdir(tmp_path)
@@ -144,20 +141,6 @@ def refused(folder, words, *logs, **flags):
     assert content(folder) == before
 
 
-def test_a_campaign_goes_on_by_the_line(folder, robot, monkeypatch, capsys):
-    def typed(*words):
-        monkeypatch.setattr(sys, "argv", ["hector", *map(str, words)])
-        assert main() == 0, capsys.readouterr().err
-
-    typed("propose", folder, "--traj", "ahead.toml", "--tune", "foot_height", "--seed", 3)
-    for number in range(2):
-        if number:
-            typed("propose", folder)
-        typed("report", folder, carded(folder, robot, "ahead", number=number))
-    typed("report", folder, "--undo")
-    assert len(walks.read_history(campaign(folder))) == 1
-
-
 # Whose log it is
 
 
@@ -177,65 +160,17 @@ def test_swapped_logs_without_cards_are_refused(folder, robot):
     refused(folder, words, *logs)
 
 
-def test_a_named_log_counts_although_another_trajectory_fits_better(folder, robot, capsys):
-    next_walk(folder)
-    logs = [f"{own}={plain(robot, other)}" for own, other in (("aside", "back"), ("back", "aside"))]
-    report(folder, plain(robot, "ahead"), *logs)
-    assert result(capsys)["logs"]["aside"]["rms_position"][0] > 0.02
-
-
-def test_logs_by_name_come_in_any_order(folder, robot, capsys):
-    next_walk(folder)
-    by_name = [f"{name}={carded(folder, robot, name)}" for name in ("back", "ahead", "aside")]
-    report(folder, *by_name)
-    assert list(result(capsys)["logs"]) == ["ahead", "aside", "back"]
-    for case, name in enumerate(("ahead", "aside", "back")):
-        kept = walks.log_paths(campaign(folder), 0)[case]
-        assert kept.read_bytes() == Path(f"{name}.npz").read_bytes()
-
-
-def test_plain_logs_are_of_the_trajectories_that_are_not_named(folder, robot):
-    next_walk(folder)
-    logs = {name: carded(folder, robot, name) for name in SPEEDS}
-    report(folder, logs["ahead"], f"aside={logs['aside']}", logs["back"])
-
-
 @pytest.mark.parametrize(
     ("logs", "words"),
     [
         (("ahad=a.npz", "a.npz", "b.npz"), "LOGS: unknown trajectory 'ahad'; did you mean 'ahead'"),
         (("ahead=a.npz", "ahead=b.npz", "c.npz"), "two files for ahead: a.npz and b.npz"),
         (("ahead=a.npz", "b.npz"), "a log of each of ahead, aside, back, got 2 files"),
-        ((), "a log of each of ahead, aside, back, got 0 files"),
     ],
 )
 def test_names_that_do_not_fit_are_refused(folder, logs, words):
     next_walk(folder)
     refused(folder, words, *logs)
-
-
-def test_a_log_of_other_weights_is_refused(folder, robot):
-    next_walk(folder, ("ahead",))
-    log = carded(folder, robot, "ahead", weights=expert(robot))
-    words = r"^ahead.npz: a walk with other weights than the proposed ones, robot/weights/0.json$"
-    refused(folder, words, log)
-    own = load_weights(walks.weights_path(folder, 0), robot)
-    higher = own._replace(others={"foot_height": own.others["foot_height"] + 0.01})
-    refused(folder, words, carded(folder, robot, "ahead", weights=higher))
-
-
-def test_a_log_of_the_set_before_is_refused(folder, robot):
-    next_walk(folder, ("ahead",))
-    log = carded(folder, robot, "ahead")
-    report(folder, log)
-    next_walk(folder, ("ahead",))
-    refused(folder, "other weights than the proposed ones, robot/weights/1.json", log)
-
-
-def test_a_log_of_another_command_of_the_same_name_is_refused(folder, robot):
-    next_walk(folder, ("ahead",))
-    log = carded(folder, robot, "ahead", card={"command": "0123456789abcdef"})
-    refused(folder, "a walk of ahead with another command, expected ahead;", log)
 
 
 @pytest.mark.parametrize(
@@ -244,7 +179,6 @@ def test_a_log_of_another_command_of_the_same_name_is_refused(folder, robot):
         ({"robot": "0123456789abcdef"}, "a walk of another robot, or with another gait"),
         ({"seconds": 4.0}, "a walk of 4.0 s, expected 0.1 s"),
         ({"trajectory": "eight", "command": "0"}, "a walk of eight, expected ahead"),
-        ({"trajectory": 7, "command": []}, "a walk of 7, expected ahead"),
     ],
 )
 def test_a_log_of_another_robot_or_length_is_refused(folder, robot, card, words):
@@ -262,33 +196,18 @@ def test_a_log_with_a_damaged_card_is_refused(folder, robot, at):
     refused(folder, "^ahead.npz: ", str(log))
 
 
-def test_a_card_that_was_edited_is_refused(folder, robot):
+def test_what_a_campaign_cannot_do_now_is_one_line(folder, robot):
     next_walk(folder, ("ahead",))
-    log = carded(folder, robot, "ahead", weights=expert(robot))
-    with np.load(log) as archive:
-        np.savez("edited.npz", **archive)
-    refused(folder, "^edited.npz: cut or changed since it was written", "edited.npz")
-
-
-def test_a_card_of_no_walk_is_that_of_a_log_without_one(folder, robot, capsys):
-    next_walk(folder, ("ahead",))
-    save_tree(Path("log.npz"), drawn(robot, "ahead"), kind="trajectory", robot=robot)
-    report(folder, "log.npz")
-    assert result(capsys)["walk"] == 0
+    with pytest.raises(InputError, match="begun with --traj ahead.toml, got s"):
+        propose.propose(Propose(folder, ("s",)))
+    log = carded(folder, robot, "ahead")
+    report(folder, log)
+    refused(folder, "no walk is waited for", log)
+    with pytest.raises(InputError, match="nothing was proposed here"):
+        report(Path("other"), log)
 
 
 # What is shown
-
-
-def test_what_a_log_shows_is_printed_before_it_counts(folder, robot, capsys):
-    next_walk(folder, ("ahead",))
-    log = plain(robot, "ahead", error=0.03, place=(1.0, 2.0))
-    propose.report(Report(folder, (log,)))
-    shown = " ".join(capsys.readouterr().err.split())
-    assert "ahead.npz: ahead; RMS error 2.1 cm horizontally, 0.0 cm in height" in shown
-    assert "roll 0.0, pitch 0.0, yaw 0.0 degrees" in shown
-    assert f"from x 1.00, y 2.00, height {robot.standing_height:.2f} m, yaw 0 degrees" in shown
-    assert "walked 0.1 s" in shown
 
 
 def test_a_fallen_walk_is_reported_as_one(folder, robot, capsys):
@@ -330,66 +249,6 @@ def test_a_report_that_is_undone_and_made_again_leaves_the_same_bytes(folder, ro
     assert again.items() >= after.items()
     kept = {str(Path(log).relative_to(folder)), "weights/2.json"}
     assert again.keys() - after.keys() == kept  # and no proposal from the history before
-
-
-def test_another_log_after_an_undo_counts_in_place_of_the_first(folder, robot, capsys):
-    next_walk(folder, ("ahead",))
-    report(folder, plain(robot, "ahead", "wrong.npz", error=0.01))
-    capsys.readouterr()
-    propose.report(Report(folder, (), undo=True))
-    shown = capsys.readouterr().out
-    assert shown.startswith("walk 0 is to be walked again, with robot/weights/0.json; its logs: ")
-    report(folder, plain(robot, "ahead", "right.npz"))
-    logs = sorted((folder / "logs").iterdir())
-    assert [log.read_bytes() for log in logs] == [
-        Path("wrong.npz").read_bytes(),
-        Path("right.npz").read_bytes(),
-    ]
-    assert len(rows(folder)) == 1
-
-
-def test_the_logs_of_an_interrupted_report_are_reported_from_the_folder(folder, robot, capsys):
-    next_walk(folder, ("ahead",))
-    log = plain(robot, "ahead")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(walks, "add_row", lambda *_: sys.exit())  # killed
-        with pytest.raises(SystemExit):
-            report(folder, log)
-    report(folder, str(folder / "logs" / "0-0.npz"))
-    assert len(rows(folder)) == 1
-    assert (folder / "logs" / "0-0.npz").read_bytes() == Path("ahead.npz").read_bytes()
-
-
-def test_each_undo_takes_back_one_report_until_there_is_none(folder, robot, capsys):
-    contents = []
-    for number in range(3):
-        next_walk(folder, ("ahead",))
-        contents.append(content(folder))
-        report(folder, carded(folder, robot, "ahead", f"{number}.npz", number=number))
-    for number in (2, 1, 0):
-        capsys.readouterr()
-        report(folder, undo=True)
-        assert result(capsys)["walk"] == number
-        assert content(folder).items() >= contents[number].items()
-    refused(folder, "^robot: no report to undo$", undo=True)
-    for number in range(3):  # the logs of the undone are there to be reported again
-        assert content(folder).items() >= contents[number].items()
-        (log,) = (folder / "logs").glob(f"{number}-0-undone-*.npz")
-        report(folder, str(log))
-        next_walk(folder)
-
-
-def test_the_line_has_logs_or_undo(folder):
-    Path("a=b.npz").write_text("")
-    for line in ("robot --undo", "robot ahead=a=b.npz --no-undo", "robot ahead=a=b.npz"):
-        parse.check(parse.from_line(["report", *line.split()]))
-    for line, words in (
-        ("robot", "^LOGS expects a value, got none; or --undo$"),
-        ("robot ahead=nowhere.npz --undo", "^--undo takes no LOGS, got 'ahead=nowhere.npz'$"),
-        ("robot ahead=nowhere.npz", "nowhere.npz: cannot read the file: No such file"),
-    ):
-        with pytest.raises(InputError, match=words):
-            parse.check(parse.from_line(["report", *line.split()]))
 
 
 STEPS = [(walks, "add_row"), (reported_walks, "write_file"), (Path, "replace"), (Path, "unlink")]
@@ -475,7 +334,7 @@ def test_reports_are_scored_by_the_present_loss(walked, monkeypatch):
     def heavier(description):
         return loss_of_robot(replace(description, loss=(("L_pos", 1e9),)))
 
-    monkeypatch.setattr(propose.tunings, "loss_of_robot", heavier)
+    instead(monkeypatch, propose.tunings, "loss_of_robot", heavier)
     after, one = rows(walked), campaign(walked)
     for number, (old, new) in enumerate(zip(before, after, strict=True)):
         scores = walks.evaluate_logs(HandsOver(), one, number)
@@ -485,23 +344,6 @@ def test_reports_are_scored_by_the_present_loss(walked, monkeypatch):
     assert (before[1].predicted, after[1].predicted) == (-0.1, None)  # it was of the other loss
     assert content(walked) == files
     next_walk(walked)  # and it goes on
-
-
-def test_reports_are_scored_by_the_present_code_of_the_loss(walked, monkeypatch):
-    before, files, loss_of = rows(walked), content(walked), walk_log.loss_of
-    monkeypatch.setattr(walk_log, "loss_of", lambda *inputs: 2.0 * loss_of(*inputs))
-    for old, new in zip(before, rows(walked), strict=True):
-        np.testing.assert_array_equal(new.losses, 2.0 * old.losses)
-    assert content(walked) == files
-
-
-def test_reports_are_those_of_a_robot_whose_file_weighs_its_loss_otherwise(walked, robot):
-    one = campaign(walked)
-    heavier = replace(robot.description, loss=(("L_pos", 1e9),), nominal=None, max_tilt=0.7)
-    walks.read_history(replace(one, robot=robot._replace(description=heavier)))
-    other = replace(robot.description, control=(("gait", (("tick", 0.02),)),))
-    with pytest.raises(InputError, match="its robot is"):
-        walks.read_history(replace(one, robot=robot._replace(description=other)))
 
 
 def test_reports_outlive_the_code_and_packages_that_took_them(walked, monkeypatch):
@@ -514,66 +356,7 @@ def test_reports_outlive_the_code_and_packages_that_took_them(walked, monkeypatc
     assert content(walked) == files
 
 
-def test_points_follow_from_the_weights_where_the_code_places_them_otherwise(walked, monkeypatch):
-    units = campaigns._units
-    thrice = lambda one: units(one) * np.where(np.arange(len(units(one))) < 18, 1.0, 3.0)  # noqa: E731
-    monkeypatch.setattr(campaigns, "_units", thrice)
-    one = campaign(walked)
-    space = walks.campaign_space(HandsOver(), one)
-    for number, row in enumerate(rows(walked)):
-        kept = load_weights(walks.weights_path(walked, number), one.robot)
-        again = campaigns.weights_at(one, space, row.point)
-        jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-12), again, kept)
-    assert row.point[-1] == pytest.approx(POINTS[1, -1] / 3.0)
-
-
-def test_a_folder_goes_on_where_its_start_is_another_file_now(folder, robot):
-    save_weights(Path("mine.json"), nominal(robot))
-    files, tune = ("ahead.toml",), ("foot_height",)
-    propose.propose(Propose(folder, files, "mine.json", tune=tune))
-    save_weights(Path("mine.json"), expert(robot))  # as another release ships another `best`
-    report(folder, carded(folder, robot, "ahead"))
-    Path("mine.json").unlink()
-    propose.propose(Propose(folder))
-    np.testing.assert_allclose(campaign(folder).start.Q.euler, nominal(robot).Q.euler)
-
-
-def test_a_log_in_the_folder_that_is_damaged_is_named_and_can_be_undone(walked, capsys):
-    path = walks.log_paths(campaign(walked), 1)[0]
-    path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(InputError, match=r"^robot/logs/1-0.npz: not a log"):
-        rows(walked)
-    capsys.readouterr()
-    report(walked, undo=True)
-    assert result(capsys)["walk"] == 1
-    assert len(rows(walked)) == 1
-
-
 # From end to end
-
-
-def test_a_folder_of_another_format_says_how_to_begin_anew(folder, robot, capsys):
-    next_walk(folder, ("ahead",))
-    report(folder, plain(robot, "ahead"))
-    record = folder / "walks.jsonl"
-    record.write_bytes(record.read_bytes().replace(b'"format": 2', b'"format": 1', 1))
-    words = "its format is 1, expected 2; .* begin anew with hector propose --start "
-    with pytest.raises(InputError, match=words + "robot/weights/N.json$"):
-        next_walk(folder)
-    begun = Path("anew")
-    begun.mkdir()
-    (begun / "metric.npz").write_bytes((folder / "metric.npz").read_bytes())
-    next_walk(begun, ("ahead",), start=str(folder / "weights" / "0.json"))
-    assert result(capsys)["walk"] == 0
-
-
-def test_the_point_of_weights_is_the_one_that_they_came_from(folder):
-    next_walk(folder, ("ahead",))
-    one = campaign(folder)
-    space = walks.campaign_space(HandsOver(), one)
-    for point in POINTS:
-        weights = campaigns.weights_at(one, space, point)
-        np.testing.assert_allclose(campaigns.point_of(one, space, weights), point, atol=1e-12)
 
 
 def test_the_log_of_a_walk_with_the_proposed_file_is_taken(folder, robot, capsys):

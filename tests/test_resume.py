@@ -1,16 +1,16 @@
 """Cut anywhere, taken up again: the same bytes; and who may write, and how a program is stopped."""
 
 import errno
-import json
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import BrokenExecutor, Executor
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -19,17 +19,15 @@ from killed import toy
 from hector_jax.cli import flags, run_folder
 from hector_jax.cli import tune as command
 from hector_jax.cli.parse import from_line
-from hector_jax.control.trajectories import command_of
 from hector_jax.control.weights import nominal
 from hector_jax.core import files as core_files
 from hector_jax.core.console import exit_code
-from hector_jax.core.files import WriteError, locked, write_file, write_json
+from hector_jax.core.files import WriteError, locked
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
 from hector_jax.core.tree_file import load_tree, save_tree
 from hector_jax.robot.model import load_robot
 from hector_jax.store.cache import load_or_make
-from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig, descend
 
 ROBOT, CONFIG, HERE = load_robot(), TuneConfig(iterations=14), Path(__file__).parent
@@ -175,22 +173,6 @@ def test_a_second_writer_waits_for_the_first_and_says_so(tmp_path, capsys):
     assert "another process is writing there; waiting" in " ".join(capsys.readouterr().err.split())
 
 
-def cut():
-    raise Cut
-
-
-def test_what_stands_is_never_half_of_a_file(tmp_path):
-    path = tmp_path / "file"
-    write_file(path, b"old")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "replace", lambda *paths: cut())
-        with pytest.raises(Cut):
-            write_file(path, b"new")
-    assert files(tmp_path) == {"file": b"old"}
-    write_file(path, b"new")
-    assert files(tmp_path) == {"file": b"new"}
-
-
 # Signals: a program with a worker that would sleep for an hour.
 
 PROGRAM = """
@@ -225,13 +207,12 @@ def is_gone(process):
 @pytest.mark.parametrize(
     ("signals", "code", "line"),
     [
-        ([signal.SIGINT], 130, "toy: interrupted"),
         ([signal.SIGINT, signal.SIGINT], 130, "toy: interrupted"),
         ([signal.SIGTERM], 143, "toy: terminated"),
         ([signal.SIGKILL], -9, ""),
         ([signal.SIGALRM, signal.SIGINT], 130, "toy: interrupted"),
     ],
-    ids=["SIGINT", "twice", "SIGTERM", "SIGKILL", "another"],
+    ids=["twice", "SIGTERM", "SIGKILL", "another"],
 )
 def test_a_signal_ends_a_program_and_its_workers_in_one_line(tmp_path, signals, code, line):
     (tmp_path / "program.py").write_text(PROGRAM)
@@ -272,112 +253,67 @@ def test_a_worker_that_is_killed_is_told_in_one_line(capsys):
     assert capsys.readouterr().err == line
 
 
-class Odd(Exception):  # noqa: N818
-    """An exception that cannot be unpickled."""
-
-    def __init__(self, one, other):
-        super().__init__(one + other)
-
-
-def _fail_oddly():
-    raise Odd("a", "b")
-
-
-def test_an_exception_that_cannot_be_unpickled_keeps_its_traceback():
-    def work():
-        with workers(1) as pool:
-            pool.submit(_fail_oddly).result()
-
-    with pytest.raises(BrokenExecutor) as caught:
-        exit_code("toy", work)
-    assert "__init__() missing 1 required" in str(caught.value.__cause__)
-
-
-def test_without_any_place_for_a_cache_a_command_ends_in_one_line(tmp_path):
-    wall = tmp_path / "wall"
-    wall.write_text("")
-    told = (
-        "import sys\n"
-        "sys.argv = ['hector', 'walk']\n"
-        "from hector_jax.cli.main import main\n"
-        "sys.exit(main())"
-    )
-    ran = subprocess.run(
-        [sys.executable, "-c", told],
-        env={**os.environ, "HOME": str(wall), "XDG_CACHE_HOME": "", "PYTHONPATH": str(HERE.parent)},
-        capture_output=True,
-        text=True,
-    )
-    assert ran.returncode == 2
-    text = (
-        f"no folder for compiled programs: {wall}/.cache/hector_jax/jax: Not a directory; set XDG"
-    )
-    *loading, line = ran.stderr.splitlines()
-    assert line.startswith(f"hector: {text}_CACHE_HOME")
-    assert loading in ([], ["loading JAX and MuJoCo"])  # if it takes long
-
-
 # hector tune --resume
 
 
 @pytest.fixture
-def begun(tmp_path, monkeypatch):
-    """A run that was cut at once."""
-    monkeypatch.setattr(command, "_tune_in", lambda folder, args: told.append(args))
-    told = []
-    command.tune(flags.Tune(traj=("c",), seeds=3, out=tmp_path / "run"))
-    return tmp_path / "run", told
-
-
-def test_a_run_is_taken_up_with_the_flags_it_was_begun_with(begun):
-    folder, told = begun
-    command.tune(flags.Tune(resume=folder, processes=1))
-    assert (told[-1].traj, told[-1].seeds, told[-1].processes) == (("c",), 3, 1)
-
-
-def test_what_changes_no_number_stays_as_it_was_unless_another_is_given(tmp_path, monkeypatch):
-    resumed = []
-    monkeypatch.setattr(command, "_tune_in", lambda folder, args: resumed.append(args))
-    own = {"video": False, "json": True, "processes": 1, "data": tmp_path / "data"}
-    command.tune(flags.Tune(out=tmp_path / "run", **own))
-    command.tune(flags.Tune(resume=tmp_path / "run"))
-    assert {name: getattr(resumed[-1], name) for name in own} == own
-    command.tune(flags.Tune(resume=tmp_path / "run", processes=3, data=tmp_path / "moved"))
-    assert (resumed[-1].processes, resumed[-1].data) == (3, tmp_path / "moved")
-
-
-def test_a_run_whose_data_are_elsewhere_is_refused_at_once(begun, tmp_path, monkeypatch):
-    folder, resumed = begun
-    there = Path.cwd()
+def asked(tmp_path, monkeypatch):
+    """Folder and flags of each run, of which nothing is computed."""
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match=f"^data: no data here; the run was begun in {there}: "):
-        command.tune(flags.Tune(resume=folder))
-    assert not (tmp_path / "data").exists()
-    (tmp_path / "mine").mkdir()
-    command.tune(flags.Tune(resume=folder, data=Path("mine")))
-    assert len(resumed) == 2
+    (tmp_path / "data").mkdir()
+    runs = []
+    fake = mock.create_autospec(command._tune_in, side_effect=lambda *run: runs.append(run))
+    monkeypatch.setattr(command, "_tune_in", fake)
+    return runs
+
+
+def line(*words):
+    return from_line(["tune", *map(str, words)])
+
+
+def test_what_changes_no_number_stays_as_it_was_unless_another_is_given(asked):
+    own = {"traj": ("c",), "seeds": 3, "video": False, "json": True, "processes": 1}
+    command.tune(flags.Tune(out=Path("run"), **own))
+    command.tune(flags.Tune(resume=Path("run")))
+    assert {name: getattr(asked[-1][1], name) for name in own} == own
+    command.tune(flags.Tune(resume=Path("run"), processes=3))
+    assert asked[-1][1].processes == 3
+
+
+def test_a_run_whose_data_are_elsewhere_is_refused_at_once(asked, tmp_path, monkeypatch):
+    command.tune(flags.Tune(traj=("c",), out=tmp_path / "run"))
+    (tmp_path / "other").mkdir()
+    monkeypatch.chdir(tmp_path / "other")
+    with pytest.raises(InputError, match=f"^data: no data here; the run was begun in {tmp_path}: "):
+        command.tune(flags.Tune(resume=tmp_path / "run"))
+    assert not Path("data").exists()
+    command.tune(flags.Tune(resume=tmp_path / "run", data=tmp_path / "data"))
+    assert len(asked) == 2
 
 
 @pytest.mark.parametrize(
-    ("asked", "message"),
+    ("given", "message"),
     [
-        ({"iterations": 50}, "run: begun with --iterations 10, got 50"),
-        ({"traj": ("s",)}, "run: begun with --traj c, got s"),
-        ({"out": Path("other")}, "only one can be given"),
+        (("--seeds", 8), "run: begun with --seeds 3, got 8"),  # the default
+        (("--traj", "straight"), "run: begun with --traj c, got straight"),
+        (("--smooth", 3), "run: begun with --smooth 2.0, got 3"),
+        (("--start", "nominal"), "run: begun with --start expert, got nominal"),
+        (("--out", "other"), "only one can be given"),
     ],
 )
-def test_another_configuration_is_not_taken_up(begun, asked, message):
-    folder, told = begun
-    before = files(folder)
+def test_another_configuration_is_not_taken_up(asked, given, message):
+    own = {"seeds": 3, "smooth": 2.0, "start": "expert", "traj": ("c",)}
+    command.tune(flags.Tune(out=Path("run"), **own))
+    before = files(Path("run"))
     with pytest.raises(ValueError, match=message):
-        command.tune(flags.Tune(**{"resume": folder, **asked}))
-    assert len(told) == 1
-    assert files(folder) == before
+        command.tune(line("--resume", "run", *given))
+    assert len(asked) == 1
+    assert files(Path("run")) == before
 
 
-def test_a_run_of_other_code_another_robot_or_none_is_not_taken_up(begun, monkeypatch):
-    folder, _ = begun
-    again = flags.Tune(resume=folder)
+def test_a_run_of_other_code_another_robot_or_none_is_not_taken_up(asked, monkeypatch):
+    command.tune(flags.Tune(traj=("c",), out=Path("run")))
+    again = flags.Tune(resume=Path("run"))
     with monkeypatch.context() as patch:
         patch.setattr(run_folder, "code_hash", lambda *modules: "another")
         with pytest.raises(InputError, match="run: begun with other code or other versions"):
@@ -388,7 +324,66 @@ def test_a_run_of_other_code_another_robot_or_none_is_not_taken_up(begun, monkey
         with pytest.raises(ValueError, match="run: begun with robot"):
             command.tune(again)
     with pytest.raises(ValueError, match="none/config.json: cannot read a file of a run of"):
-        command.tune(flags.Tune(resume=folder / "none"))
+        command.tune(flags.Tune(resume=Path("run/none")))
+
+
+def test_a_run_of_another_trajectory_is_not_taken_up(tmp_path):
+    begun, here = ({"command": {"velocity": [[v, 0.0]]}, "seconds": 2.0} for v in (0.3, 0.5))
+    with pytest.raises(ValueError, match="begun with command.velocity .*0.3.*, here is .*0.5"):
+        run_folder.check_agreement(tmp_path, begun, here)
+
+
+def test_runs_of_the_same_second_have_folders_of_their_own(asked, tmp_path, monkeypatch):
+    """Also those that look at the same moment and find nothing there."""
+
+    class Clock(run_folder.datetime):
+        @classmethod
+        def now(cls):
+            return cls(2026, 11, 21, 9, 34, 59)
+
+    monkeypatch.setattr(run_folder, "datetime", Clock)
+    for _ in range(3):
+        command.tune(flags.Tune(traj=("s",), runs=tmp_path))
+    names = [folder.name for folder, _ in asked]
+    assert names == ["20261121-093459", "20261121-093500", "20261121-093501"]
+
+
+def test_several_trajectories_are_one_run(asked):
+    command.tune(flags.Tune(traj=("all",), runs=Path("runs")))
+    command.tune(flags.Tune(traj=("c", "all"), out=Path("out")))
+    command.tune(flags.Tune(resume=Path("out")))
+    (auto, first), (named, second), again = asked
+    assert auto.parent == Path("runs/straight-c-s")
+    assert first.traj == ("straight", "c", "s")
+    assert named == Path("out")
+    assert again[1].traj == second.traj == ("c", "straight", "s")
+
+
+SHORT = 'name = "short"\n[[segment]]\nseconds = 2.0\nv_x = 0.2\n'
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"traj": ("c", "short.toml")}, "of one length, got c 4 s, short 2 s; add --each"),
+        ({"traj": ("short.toml", "./short.toml")}, "short.toml and ./short.toml are both named s"),
+    ],
+)
+def test_what_one_set_cannot_be_tuned_for_is_one_line(asked, changes, message):
+    Path("short.toml").write_text(SHORT)
+    with pytest.raises(InputError, match=message):
+        command.tune(flags.Tune(**changes))
+    assert {path.name for path in Path().iterdir()} == {"data", "short.toml"}
+
+
+def test_each_trajectory_of_a_file_has_a_folder_of_its_name(asked):
+    Path("mine.toml").write_text(SHORT)
+    several = flags.Tune(traj=("c", "mine.toml"), each=True)
+    command.tune(replace(several, out=Path("out")))
+    command.tune(replace(several, resume=Path("out")))
+    assert [folder for folder, _ in asked] == 2 * [Path("out/c"), Path("out/short")]
+    with pytest.raises(InputError, match="out: its trajectories were tuned one by one; add --each"):
+        command.tune(flags.Tune(traj=("mine.toml",), resume=Path("out")))
 
 
 @pytest.mark.slow
@@ -417,97 +412,3 @@ def test_killed_25_times_on_all_cores_it_ends_in_the_bytes_of_an_unbroken_run_on
     if job == "collection":
         more = len(looks(tmp_path / "cut" / job)) - len(looks(tmp_path / "whole" / job))
         assert more <= hits  # each kill costs one walk, at most
-
-
-def test_a_run_of_another_trajectory_is_not_taken_up(tmp_path):
-    begun = {"command": {"velocity": [[0.3, 0.0]]}, "seconds": 2.0}
-    with pytest.raises(ValueError, match="begun with command.velocity .*0.3.*, here is .*0.5"):
-        run_folder.check_agreement(
-            tmp_path, begun, {"command": {"velocity": [[0.5, 0.0]]}, "seconds": 2.0}
-        )
-
-
-def test_a_run_folder_that_cannot_be_made_is_not_said_to_exist(tmp_path, monkeypatch):
-    def full(path, target):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(Path, "rename", full)
-    for named in ({"out": tmp_path / "run"}, {"runs": tmp_path}):
-        with pytest.raises(
-            InputError, match=f"^cannot write {tmp_path}.*: No space left on device$"
-        ):
-            command.tune(flags.Tune(traj=("c",), **named))
-
-
-def test_a_run_is_not_resumed_from_another_start(tmp_path):
-    def run(**others):
-        return command._Run(
-            setup=Setup(Executor(), TuneConfig(), load_robot()),
-            folder=tmp_path,
-            args=flags.Tune(traj=("straight",)),
-            start=nominal()._replace(others={name: np.array(x) for name, x in others.items()}),
-            trajectories=(command_of("straight"),),
-            net=SimpleNamespace(params=None),
-        )
-
-    for begun, here in ((run(), run(turn_lead=0.8)), (run(turn_lead=0.8), run())):
-        write_json(tmp_path / "config.json", {})
-        noted = command._note_settings(begun)
-        assert command._note_settings(begun) == noted
-        with pytest.raises(InputError, match="start of other numbers beside Q and R"):
-            command._note_settings(here)
-    write_json(tmp_path / "config.json", {})
-    command._note_settings(run(turn_lead=0.8))
-    with pytest.raises(InputError, match=r"begun with start.others.turn_lead 0.8, here is 0.9"):
-        command._note_settings(run(turn_lead=0.9))
-
-
-# A flag that was given is a flag that was given, also at its default
-
-
-def line(*words):
-    return from_line(["tune", *map(str, words)])
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        (("--seeds", 8), "run: begun with --seeds 3, got 8"),
-        (("--traj", "straight"), "run: begun with --traj c, got straight"),
-        (("--smooth", 3), "run: begun with --smooth 2.0, got 3"),
-        (("--walk-plants", 2), "run: begun with --walk-plants 1, got 2"),
-        (("--start", "nominal"), "run: begun with --start expert, got nominal"),
-    ],
-)
-@pytest.mark.parametrize("way", ["line", "file"])
-def test_a_given_default_is_not_taken_for_the_flag_of_the_run(
-    tmp_path, monkeypatch, given, message, way
-):
-    resumed = []
-    monkeypatch.setattr(command, "_tune_in", lambda folder, args: resumed.append(args))
-    (tmp_path / "data").mkdir()
-    own = {"seeds": 3, "smooth": 2.0, "walk_plants": 1, "start": "expert", "traj": ("c",)}
-    folder = tmp_path / "run"
-    command.tune(flags.Tune(out=folder, data=tmp_path / "data", **own))
-    if way == "file":
-        text = f"{given[0][2:]} = {json.dumps(given[1])}\n"
-        (tmp_path / "given.toml").write_text(text)
-        given = ("--config", tmp_path / "given.toml")
-    with pytest.raises(InputError, match=message):
-        command.tune(line("--resume", folder, *given))
-    command.tune(line("--resume", folder, "--seeds", 3, "--processes", 2))
-    assert {name: getattr(resumed[-1], name) for name in own} == own
-
-
-def test_runs_of_each_trajectory_are_resumed_together(tmp_path, monkeypatch):
-    resumed = []
-    monkeypatch.setattr(command, "_tune_in", lambda folder, args: resumed.append((folder, args)))
-    command.tune(line("--each", "--traj", "c", "s", "--out", tmp_path / "run"))
-    (tmp_path / "data").mkdir()
-    command.tune(line("--each", "--resume", tmp_path / "run", "--data", tmp_path / "data"))
-    assert [(folder.name, args.traj) for folder, args in resumed[2:]] == [
-        ("c", ("c",)),
-        ("s", ("s",)),
-    ]
-    with pytest.raises(InputError, match="c: no runs of single trajectories in it; leave out --e"):
-        command.tune(line("--each", "--resume", tmp_path / "run" / "c"))

@@ -2,8 +2,6 @@
 
 import contextlib
 import io
-import subprocess
-import sys
 from functools import partial
 
 import mujoco
@@ -55,25 +53,6 @@ def body_pairs(model, data):
 # What the file says
 
 
-def test_robot_weighs_twelve_kilograms_and_has_sixteen_degrees_of_freedom(model, robot):
-    assert robot.mass == pytest.approx(12.0, abs=0.05)
-    assert (model.nv, model.nu) == (16, 10)
-
-
-def test_knees_have_67_newton_metres_and_the_others_half(robot):
-    np.testing.assert_array_equal(robot.torque_limit, [33.5, 33.5, 33.5, 67.0, 33.5] * 2)
-
-
-def test_joint_limits_are_those_of_the_facts_sheet(robot):
-    np.testing.assert_array_equal(robot.joint_lower, [-0.70, -0.60, -0.6, -2.38, -1.4] * 2)
-    np.testing.assert_array_equal(robot.joint_upper, [0.70, 0.60, 1.9, -0.10, 1.4] * 2)
-
-
-def test_actuators_and_joints_come_left_leg_then_right(model):
-    assert [model.actuator(i).name for i in range(model.nu)] == list(Description.joints)
-    assert list(model.actuator_trnid[:, 0]) == list(range(1, 11))
-
-
 def test_standing_trunk_is_at_548_millimetres_with_both_soles_on_the_floor(model, robot):
     data = standing(model)
     assert robot.trunk_height == pytest.approx(0.548, abs=1e-3)
@@ -82,15 +61,6 @@ def test_standing_trunk_is_at_548_millimetres_with_both_soles_on_the_floor(model
             data.site(foot).xpos, [-0.0135, side * 0.0942, 0.0], rtol=0, atol=1e-6
         )
     np.testing.assert_allclose(np.rad2deg(robot.standing_joints), [0, 0, 45, -90, 45] * 2)
-
-
-def test_line_foot_reaches_nine_centimetres_ahead_and_six_behind(model, robot):
-    assert (robot.toe, robot.heel) == pytest.approx((0.09, 0.06), abs=1e-12)
-    data = standing(model)
-    for side in ("left", "right"):
-        for end in ("toe", "heel"):
-            ball = model.geom(f"{side}_{end}")
-            assert data.geom(ball.name).xpos[2] - ball.size[0] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_composite_body_is_that_of_the_facts_sheet(robot):
@@ -195,45 +165,10 @@ def refusal(tmp_path, text):
     return message
 
 
-def drop_line(text, *marks):
-    return "\n".join(line for line in text.split("\n") if not any(mark in line for mark in marks))
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        pytest.param(lambda t: t[: len(t) // 2], ["malformed XML", "line"], id="cut in half"),
-        pytest.param(lambda t: "", ["malformed XML"], id="empty"),
-        pytest.param(lambda t: "<sdf/>", ["<sdf>", "expected <mujoco>"], id="other root"),
         pytest.param(lambda t: t + " " * 1_000_001, ["1.0 MB", "at most 1 MB"], id="too big"),
-        pytest.param(
-            lambda t: '<!DOCTYPE mujoco [<!ENTITY a "b">]>' + t, ["DOCTYPE"], id="doctype"
-        ),
-        pytest.param(
-            lambda t: t.replace("<asset>", '<include file="/etc/passwd"/><asset>'),
-            ["<include>", "/etc/passwd", "self-contained"],
-            id="include",
-        ),
-        pytest.param(
-            lambda t: t.replace('mass="5.512"', 'mass="-5.512"'),
-            ["<inertial> of 'trunk'", "mass is '-5.512'", "above 0"],
-            id="negative mass",
-        ),
-        pytest.param(
-            lambda t: drop_line(t, "<freejoint", "<key "),
-            ["no keyframe 'standing'", "standing = { joint = angle }"],
-            id="no pose",
-        ),
-        pytest.param(
-            lambda t: drop_line(t, '<motor name="right_ankle"'),
-            ["joint 'right_ankle' has no torque limit", "effort in a URDF"],
-            id="nine actuators",
-        ),
-        pytest.param(
-            lambda t: t.replace('"left_foot_point"', '"left_foot_pt"'),
-            ["no site 'left_foot_point'", "did you mean 'left_foot_pt'", "right_foot_point"],
-            id="renamed foot site",
-        ),
         pytest.param(
             lambda t: t.replace('name="right_toe"', 'name="right_tip"'),
             ["no sphere 'right_toe' on body 'right_foot'"],
@@ -250,25 +185,11 @@ def drop_line(text, *marks):
             id="legs swapped",
         ),
         pytest.param(
-            lambda t: (
-                t.replace("left_knee", "?")
-                .replace("left_ankle", "left_knee")
-                .replace("?", "left_ankle")
-            ).replace("<left_ankle", "<?"),
-            ["joint 'left_knee' is on body 'left_calf'", "name each leg from the trunk down"],
-            id="knee and ankle swapped",
-        ),
-        pytest.param(
             lambda t: t.replace('axis="0 1 0" range="-2.38', 'axis="0 -1 0" range="-2.38'),
             ["keyframe 'standing'", "expected"],
             id="knee axis reversed",
         ),
         *(pytest.param(partial(replaced, *texts), words, id=name) for name, texts, words in WRONG),
-        pytest.param(
-            lambda t: t.replace('name="standing"', 'name="stand"'),
-            ["no keyframe 'standing'", "stand"],
-            id="renamed keyframe",
-        ),
         pytest.param(
             lambda t: t.replace(
                 'class="contact" pos="0.09 0 -0.03"', 'class="contact" pos="0.09 0 0"'
@@ -282,27 +203,3 @@ def test_wrong_description_is_refused_in_one_line(tmp_path, change, words):
     message = refusal(tmp_path, change(TEXT))
     for word in words:
         assert word in message
-
-
-def test_missing_file_and_folder_are_refused_in_one_line(tmp_path):
-    for path in (tmp_path / "nothing.xml", tmp_path):
-        with pytest.raises(ValueError, match="cannot read the robot description") as caught:
-            load_robot(path)
-        assert str(path) in str(caught.value)
-
-
-def test_binary_file_is_refused(tmp_path):
-    path = tmp_path / "robot.xml"
-    path.write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(ValueError, match="not a text file"):
-        load_robot(path)
-
-
-def test_loading_the_robot_prints_nothing():
-    done = subprocess.run(
-        [sys.executable, "-c", "from hector_jax.robot.model import load_robot; load_robot()"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert (done.stdout, done.stderr) == ("", "")

@@ -9,21 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pretend import pretend_score
-from scenes import (
-    DIRECTIONS,
-    Level,
-    SceneConfig,
-    as_result,
-    evaluate_level,
-    make_scenes,
-    significant,
-    table,
-)
+from scenes import DIRECTIONS, Level, SceneConfig, evaluate_level, make_scenes, significant
 
-from hector_jax.control.weights import nominal
-from hector_jax.core.files import as_json
 from hector_jax.core.tree import stack
-from hector_jax.sim.world import hfs
 
 ROOT = Path(__file__).parents[1]
 SMALL = SceneConfig(forces=(50.0, 100.0), frictions=(0.4, 0.2), phases=3)
@@ -47,43 +35,6 @@ def test_pushes_come_from_eight_sides_at_all_phases_of_a_cycle():
     start = np.array([scene.push.start[0] for scene in found[:3]])
     np.testing.assert_allclose((start - start[0]) / 0.4, [0, 1 / 3, 2 / 3])
     assert all(scene.push.start[0] + 1.0 < scene.seconds for scene in found)
-
-
-def test_scenes_hold_all_that_may_be_in_the_way():
-    found = make_scenes(SMALL, "s")
-    sizes = {kind: [level.size for level in found if level.kind == kind] for kind, _ in found}
-    assert sizes["calm"] == ["floor"]
-    assert sizes["friction"] == [0.4, 0.2]
-    assert sizes["slope"] == ["up", "down", "left", "right"]
-    assert sizes["delay"] == [6.0, 8.0]
-    assert [s[0].changes[0].payload for level, s in found.items() if level.kind == "payload"] == [
-        2.0,
-        2.0,
-    ]
-    assert not found[Level("calm", "floor")][0].changes
-
-
-def test_a_scene_becomes_the_walk_of_a_set_on_a_plant():
-    scenes = make_scenes(SMALL, "straight")
-    scene = scenes[Level("slope", "up")][0]
-    job = scene.job(nominal(), hfs(), 7)
-    assert (job.seed, job.seconds, job.push) == (7, scene.seconds, scene.push)
-    slow = scenes[Level("delay", 8.0)][0].job(nominal(), hfs(), 7).imperfections
-    assert (slow.delay, slow.lag) == (0.008, 0.006)
-    assert slow.estimator.velocity > 0.0
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"phases": 0}, "phases must be a whole number of at least 1, got 0"),
-        ({"forces": (50.0, -1.0)}, r"forces must be a list, each a number above 0, got \(50.0, -1"),
-        ({"frictions": ()}, "frictions must differ, at least one, got"),
-    ],
-)
-def test_scenes_that_make_no_sense_are_refused(wrong, message):
-    with pytest.raises(ValueError, match=message):
-        SceneConfig(**wrong)
 
 
 def test_a_set_is_judged_by_the_median_of_paired_ratios():
@@ -117,20 +68,6 @@ def test_whether_a_set_falls_more_often_is_an_exact_test_on_the_scenes_that_diff
 def test_several_tests_are_corrected_step_by_step():
     assert significant([0.2, 0.012, 0.001, 0.02]) == [2, 1, 3]  # 0.05 / 4, / 3, / 2
     assert significant([0.013, 0.013, 0.013, 0.013]) == []
-
-
-def test_the_table_has_a_row_per_level_and_marks_what_does_not_count():
-    base, levels = np.full((2, 4), 2e6), (Level("push", 50.0), Level("slope", "up"))
-    sets = {"nominal": scores(base), "with": scores(0.5 * base, {(0, 0)})}
-    cells = {
-        level: {name: evaluate_level(one, sets["nominal"]) for name, one in sets.items()}
-        for level in levels
-    }
-    text = table(cells, dict.fromkeys(levels, 2e6)).splitlines()
-    assert len(text) == 4
-    assert len({line.count("|") for line in text}) == 1
-    assert text[2] == "| push 50 N | 0 of 8 | 2.00 | 1 of 8 | 0.50 * |"
-    assert json.loads(as_json(as_result(cells[levels[0]]["with"])))["ratio"]["low"] is None
 
 
 @pytest.mark.slow

@@ -62,29 +62,6 @@ def test_a_worker_draws_what_its_parent_draws(monkeypatch):
     np.testing.assert_array_equal(drawn, jax.random.PRNGKey(3))
 
 
-@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinity on this system")
-def test_several_workers_stay_on_a_core_each_and_one_alone_has_them_all():
-    mine = os.sched_getaffinity(0)
-    assert runtime._cores(1) == [None]
-    for count in (2, len(mine), 2 * len(mine) + 1):
-        cores = runtime._cores(count)
-        assert len(cores) == count
-        assert set(cores) <= mine
-        assert len(set(cores)) == min(max(count, 2), len(mine))
-
-
-def test_a_failing_caller_ends_the_workers():
-    with pytest.raises(KeyError), runtime.workers(1) as pool:
-        raise KeyError
-    with pytest.raises(RuntimeError, match="shutdown"):
-        pool.submit(abs, 1)
-
-
-def test_fewer_than_one_worker_is_refused():
-    with pytest.raises(ValueError, match="greater than 0"), runtime.workers(0):
-        pass
-
-
 @pytest.mark.slow
 def test_processes_load_the_programs_that_one_of_them_compiled(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

@@ -101,13 +101,6 @@ def test_a_record_is_carried_on_to_a_larger_budget_and_read_for_a_smaller_one(tm
     same(small, run(tmp_path, SearchConfig(30, 10, seed=3), walk=unasked)["s"])
 
 
-def test_a_record_says_its_format_first(tmp_path):
-    """Another number makes all that was written before unreadable."""
-    run(tmp_path)
-    head = json.loads((tmp_path / "s.jsonl").read_text().splitlines()[0])
-    assert next(iter(head.items())) == ("format", 1)
-
-
 def test_searches_in_lock_step_are_those_that_go_alone(tmp_path):
     together = run(tmp_path / "both", names=("c", "s"))
     alone = run(tmp_path / "one", names=("s",))["s"]
@@ -185,12 +178,7 @@ def test_a_record_of_another_search_is_refused(tmp_path):
 
 @pytest.mark.parametrize(
     ("line", "says"),
-    [
-        (b"{}\n", "line 3 is damaged"),
-        (b'{"steps": [[0]], "losses": [1]}\n', "expected"),
-        (b"\xff\n", "line 3 is damaged"),
-        (b"[1, 2]\n", "line 3 is damaged"),
-    ],
+    [(b"{}\n", "line 3 is damaged"), (b'{"steps": [[0]], "losses": [1]}\n', "expected")],
 )
 def test_a_damaged_record_is_refused(tmp_path, line, says):
     run(tmp_path)
@@ -198,12 +186,6 @@ def test_a_damaged_record_is_refused(tmp_path, line, says):
     lines = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(b"".join([*lines[:2], line, *lines[3:]]))
     with pytest.raises(ValueError, match=says):
-        run(tmp_path)
-
-
-def test_another_file_is_no_record(tmp_path):
-    (tmp_path / "s.jsonl").write_text("[1]\nmine\n")
-    with pytest.raises(ValueError, match="not the record of a search"):
         run(tmp_path)
 
 
@@ -217,24 +199,3 @@ def test_a_start_outside_the_box_or_with_unlike_feet_is_refused(tmp_path):
     with pytest.raises(ValueError, match="feet share one R"):
         run(tmp_path, start=limping)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("wrong", "says"),
-    [
-        ({"population": 3}, "population"),
-        ({"budget": 9}, "budget"),
-        ({"seed": -1}, "seed"),
-        ({"spread": 0.0}, "spread"),
-        ({"spread": float("nan")}, "spread"),
-    ],
-)
-def test_wrong_settings_are_named(wrong, says):
-    with pytest.raises(ValueError, match=says):
-        SearchConfig(**wrong)
-
-
-def test_a_search_without_its_package_says_what_to_install(tmp_path, monkeypatch):
-    monkeypatch.setattr("hector_jax.core.inputs.find_spec", lambda name: None)
-    with pytest.raises(ValueError, match=r"hector-jax\[search\]"):
-        run(tmp_path)

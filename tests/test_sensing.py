@@ -193,13 +193,6 @@ def test_errors_have_their_stated_sizes():
     assert np.abs(end[:, [0, 1, 5]]).max() < 0.003
 
 
-def test_a_seed_gives_the_same_errors():
-    estimator = standin(0).estimator
-    first, same, other = (sensing.draw_errors(estimator, 10, s, 10, 50) for s in (1, 1, 2))
-    np.testing.assert_array_equal(first, same)
-    assert (first != other).any()
-
-
 def test_the_controller_is_told_the_truth_plus_the_error():
     world = build_world(ideal())
     data = mujoco.MjData(world.model)

@@ -1,30 +1,25 @@
 """Flags of a tuning that make `best` smoother or safer."""
 
 from concurrent.futures import Executor
-from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 from model import BEST_OTHERS, CONFIG, ROBOT
-from pretend import pretend_tuning
-from synthetic import synthetic_walk
+from pretend import instead, pretend_tuning
 
 from hector_jax.cli import run_folder
 from hector_jax.cli import tune as command
 from hector_jax.cli.flags import Tune
-from hector_jax.control.footstep import FootstepConfig
-from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.parameters import GROUPS
 from hector_jax.control.trajectories import command_of
 from hector_jax.control.weights import nominal
-from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.store import tunings
 from hector_jax.store.setup import Setup
 from hector_jax.store.tunings import Tuned
-from hector_jax.tuning.loss import alphas, between_loss
+from hector_jax.tuning.loss import alphas
 from hector_jax.verdict import choice
 
 
@@ -36,7 +31,7 @@ def _tunings(monkeypatch, folder, flags, robot=ROBOT, config=CONFIG):
         seen.update({name: (setup.config, start, problem) for name, problem in problems.items()})
         return dict.fromkeys(problems, Tuned(pretend_tuning(3, start), ""))
 
-    monkeypatch.setattr(tunings, "tune_all", tune)
+    instead(monkeypatch, tunings, "tune_all", tune)
     setup, course = Setup(Executor(), config, robot), (command_of("straight"),)
     run = command._Run(setup, folder, flags, nominal(), course, SimpleNamespace(params=None))
     command._tune_sets(run)
@@ -56,29 +51,6 @@ def test_best_alone_is_tuned_smoothly_on_drawn_models_with_its_own_numbers(monke
     assert config.others == GROUPS["integral"]
     assert (config.rollout, problem.draws) == (CONFIG.rollout, choice.DRAWS)
     jax.tree.map(np.testing.assert_array_equal, start[:2], nominal()[:2])
-
-
-def test_the_numbers_of_best_follow_robot_controller_and_start(monkeypatch, tmp_path):
-    tall = ROBOT._replace(standing_height=2 * ROBOT.standing_height)
-    seen = _tunings(monkeypatch, tmp_path / "tall", Tune(smooth=0.0), tall)
-    assert seen["best"][1].others["position_limit"] == 0.161
-    assert alphas(seen["best"][0].loss) == alphas(CONFIG.loss)  # no price, no term
-    own = {"mpc": MpcConfig(position_limit=20.0), "footstep": FootstepConfig(width=0.3)}
-    rollout = replace(CONFIG.rollout, walk=replace(CONFIG.rollout.walk, **own))
-    config = replace(CONFIG, rollout=rollout)
-    start = _tunings(monkeypatch, tmp_path / "own", Tune(), config=config)["best"][1]
-    save_weights(tmp_path / "start.json", start)
-    others = load_weights(tmp_path / "start.json").others  # in their boxes
-    assert others == {**BEST_OTHERS, "position_limit": 10.0, "footstep_width": 0.2}
-
-
-def test_changes_between_switches_are_those_of_control_without_switches():
-    walk = synthetic_walk(0, 60)
-    wrench = np.concatenate([walk.command.force, walk.command.moment], axis=-1)
-    changes = np.sum(np.diff(wrench, axis=0) ** 2, axis=(1, 2))
-    stays = np.all(walk.contact[1:] == walk.contact[:-1], axis=-1)
-    assert 0 < stays.sum() < len(stays)
-    assert float(between_loss(walk)) == pytest.approx(changes[stays].sum())
 
 
 def test_a_limit_of_the_position_error_is_set_once():

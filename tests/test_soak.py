@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 from collections import Counter
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -18,7 +17,7 @@ from hector_jax.control.weights import nominal
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect
 from hector_jax.robot.model import load_robot
-from hector_jax.tuning.difftune import TuneConfig, tune, tune_step
+from hector_jax.tuning.difftune import TuneConfig, tune
 from hector_jax.tuning.rollout import RolloutConfig, Scenario
 
 ROOT = Path(__file__).parents[1]
@@ -62,18 +61,6 @@ def test_nothing_is_compiled_after_the_first_iteration(work, rule):
     assert [count for *_, count in seen[1:]] == (len(seen) - 1) * [0]
     if rule == "gauss_newton":
         assert {accepted for _, accepted, _ in seen} == {True, False}
-
-
-@pytest.mark.slow
-def test_a_step_whose_shape_was_evaluated_is_not_traced_again(work):
-    scenario = Scenario(ROBOT, named_command("c"), ANCHOR, last_command)
-    step = partial(tune_step, TuneConfig(rollout=RolloutConfig(ticks=10)))
-    inputs, trace = (scenario, nominal()), "jaxpr_trace_duration"
-    jax.eval_shape(step, *inputs)
-    assert work[f"/jax/core/compile/{trace}"] > 0
-    work.clear()
-    step(*inputs)
-    assert work[f"/jax/core/compile/{trace}"] == 0
 
 
 def held():

@@ -4,15 +4,8 @@ import numpy as np
 import pytest
 from oracles import pack_state
 
-from hector_jax.core.geometry import euler_from_rotation, rot_z, rotation_from_euler, skew
-from hector_jax.core.trajectory import (
-    Load,
-    State,
-    Wrench,
-    pack_wrench,
-    unpack_wrench,
-    zero_wrench,
-)
+from hector_jax.core.geometry import rot_z, rotation_from_euler, skew
+from hector_jax.core.trajectory import Load, State, Wrench, pack_wrench, zero_wrench
 from hector_jax.robot import srbm
 from hector_jax.robot.model import load_robot
 
@@ -130,17 +123,6 @@ def test_runge_kutta_is_of_fourth_order(robot):
     exact = walk(64)
     ratio = jnp.linalg.norm(walk(2) - exact) / jnp.linalg.norm(walk(4) - exact)
     assert 12 < ratio < 20
-
-
-def test_packing_round_trips():
-    wrench = some_wrench(6)
-    for x, y in zip(unpack_wrench(pack_wrench(wrench)), wrench, strict=True):
-        assert (x == y).all()
-
-
-def test_euler_angles_round_trip():
-    euler = jnp.array([0.3, -0.7, 2.9])
-    np.testing.assert_allclose(euler_from_rotation(rotation_from_euler(euler)), euler, atol=1e-12)
 
 
 def test_a_load_accelerates_the_centre_of_mass_and_turns_the_body_about_it(robot):

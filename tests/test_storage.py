@@ -2,7 +2,6 @@
 
 import json
 import os
-import pickle
 from typing import NamedTuple
 
 import jax
@@ -56,11 +55,6 @@ def test_a_tree_comes_back_as_it_was_written(saved):
     assert read_card(saved) == card
 
 
-def test_the_file_is_a_plain_npz(saved):
-    with np.load(saved, allow_pickle=False) as archive:
-        np.testing.assert_array_equal(archive["leaf.force"], TREE.leaf.force)
-
-
 def test_the_same_tree_makes_the_same_bytes(saved, tmp_path):
     again = tmp_path / "again.npz"
     save_tree(again, TREE, kind="thing", robot=ROBOT, about={"units": "N"})
@@ -86,19 +80,6 @@ def test_flipped_bytes_are_refused_by_name(saved):
             load_tree(saved, TREE, kind="thing")
 
 
-def test_a_renamed_pickle_is_refused(tmp_path):
-    path = tmp_path / "tree.npz"
-    path.write_bytes(pickle.dumps({"a": 1}) * 20)
-    with pytest.raises(ValueError, match="tree.npz: cut or changed"):
-        load_tree(path, TREE, kind="thing")
-
-
-def test_objects_are_not_written(tmp_path):
-    with pytest.raises(ValueError, match="[Oo]bject"):
-        save_tree(tmp_path / "tree.npz", {"a": np.array([None])}, kind="thing")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_another_kind_robot_format_layout_or_shape_is_refused(saved, monkeypatch):
     with pytest.raises(ValueError, match="tree.npz: holds thing, expected net"):
         load_tree(saved, TREE, kind="net")
@@ -115,64 +96,19 @@ def test_another_kind_robot_format_layout_or_shape_is_refused(saved, monkeypatch
         load_tree(saved, TREE, kind="thing")
 
 
-def test_an_axis_of_length_zero_takes_any_length(saved):
-    free = TREE._replace(leaf=TREE.leaf._replace(force=np.zeros((0, 3))))
-    assert load_tree(saved, free, kind="thing")[0].leaf.force.shape == (2, 3)
-
-
-def test_a_missing_file_is_one_line_with_its_name(tmp_path):
-    with pytest.raises(ValueError, match="cannot read .*nothing.npz: No such file"):
-        load_tree(tmp_path / "nothing.npz", TREE, kind="thing")
-
-
 def test_an_unwritable_folder_is_one_line_with_its_name(tmp_path):
     (tmp_path / "wall").write_text("a file, no folder")
     with pytest.raises(WriteError, match="cannot write .*wall/tree.npz"):
         save_tree(tmp_path / "wall" / "tree.npz", TREE, kind="thing")
 
 
-def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(saved, monkeypatch):
-    before = saved.read_bytes()
-
-    def full_disk(handle):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(files.os, "fsync", full_disk)
-    with pytest.raises(WriteError, match="cannot write .*tree.npz: No space left"):
-        save_tree(saved, TREE, kind="other")
-    assert saved.read_bytes() == before
-    assert [p.name for p in saved.parent.iterdir()] == ["tree.npz"]
-
-
-def test_text_comes_back(tmp_path):
-    path = tmp_path / "tree.npz"
-    save_tree(path, {"words": np.array(["a", "longer"]), "x": np.zeros(2)}, kind="thing")
-    like = {"words": np.zeros(0, "U1"), "x": np.zeros(0)}
-    assert load_tree(path, like, kind="thing")[0]["words"].tolist() == ["a", "longer"]
-
-
-def test_a_file_is_there_under_its_name_at_any_moment(tmp_path, monkeypatch):
-    path, replace, there = tmp_path / "file", files.os.replace, []
-
-    def watched(*paths):
-        there.append(path.exists())
-        replace(*paths)
-        there.append(path.exists())
-
-    files.write_file(path, b"old")
-    monkeypatch.setattr(files.os, "replace", watched)
-    files.write_file(path, b"new")
-    assert there == [True, True]
-
-
-@pytest.mark.parametrize("mask", [0o022, 0o077])
-def test_files_have_the_rights_that_the_umask_leaves(tmp_path, mask):
-    before = os.umask(mask)
+def test_files_have_the_rights_that_the_umask_leaves(tmp_path):
+    before = os.umask(0o027)
     try:
         files.write_file(tmp_path / "file", b"data")
     finally:
         os.umask(before)
-    assert (tmp_path / "file").stat().st_mode & 0o777 == 0o666 & ~mask
+    assert (tmp_path / "file").stat().st_mode & 0o777 == 0o640
 
 
 def test_a_robot_is_known_by_its_numbers():
@@ -204,76 +140,6 @@ def test_weights_come_back_as_they_were_written(tmp_path):
         jax.tree.map(np.testing.assert_array_equal, again, weights)
 
 
-def _edit(change):
-    tree = {
-        "Q": {n: [1.0, 2.0, 3.0] for n in ("euler", "position", "ang_velocity", "velocity")},
-        "R": {n: [[1e-4, 1e-4, 1e-4]] * 2 for n in ("force", "moment")},
-    }
-    change(tree)
-    return json.dumps(tree)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda t: t["Q"].pop("velocity"), 'missing weight "Q.velocity"'),
-        (lambda t: t.pop("R"), 'missing weight "R"'),
-        (lambda t: t["Q"].update(eular=[1, 1, 1]), "unknown weight 'Q.eular'; did you mean 'Q.eul"),
-        (lambda t: t.update(note="x"), "unknown weight 'note'.*known: Q, R"),
-        (lambda t: t["Q"].update(euler=[1, -1, 1]), r"Q.euler\[1\] must be a number from 1e-12"),
-        (lambda t: t["Q"].update(euler=[1, 1, 0]), r"Q.euler\[2\].* to 1e\+12, got 0"),
-        (lambda t: t["Q"].update(euler=[1, 1, True]), r"Q.euler\[2\] must be a number.*got True"),
-        (lambda t: t["Q"].update(euler=[1e308, 1, 1]), r"Q.euler\[0\].* to 1e\+12, got 1e\+308"),
-        (
-            lambda t: t["R"].update(force=[[1, 1, 1], [1, 1, 5e-324]]),
-            r"R.force\[1\]\[2\].*from 1e-12",
-        ),
-        (lambda t: t["Q"].update(euler=[1, float("nan"), 1]), r"Q.euler\[1\].*got nan"),
-        (lambda t: t["Q"].update(euler=[1, 1, float("inf")]), r"Q.euler\[2\].*got inf"),
-        (lambda t: t["Q"].update(euler=[1, 1]), "Q.euler must be 3 numbers, got"),
-        (lambda t: t["Q"].update(euler=["a", 1, 1]), r"Q.euler\[0\] must be a number.*got 'a'"),
-        (lambda t: t["Q"].update(euler=[10**400, 1, 1]), r"Q.euler\[0\].* to 1e\+12, got 1000"),
-        (lambda t: t["R"].update(force=[[1, 1, 1], [1]]), "R.force must be 2 x 3 numbers, got"),
-        (lambda t: t["R"].update(moment=None), "R.moment must be 2 x 3 numbers, got null"),
-        (lambda t: t.update(Q=[1, 2]), "Q must be an object"),
-        (lambda t: t.update(others=[1, 2]), "others must be an object; expected"),
-        (
-            lambda t: t.update(others={"frition": 1}),
-            "unknown weight 'others.frition'; did you mean 'others.fri",
-        ),
-        (
-            lambda t: t.update(others={"friction": 2}),
-            "others.friction must be a number from 0.1",
-        ),
-        (lambda t: t.update(others={"friction": [1]}), "others.friction must be a number, got"),
-        (lambda t: t.update(others={"kp": [9, 9, 9]}), "others.kp must be 5 numbers, got"),
-    ],
-)
-def test_bad_weights_are_one_line_with_file_and_entry(tmp_path, change, message):
-    path = tmp_path / "weights.json"
-    path.write_text(_edit(change))
-    with pytest.raises(ValueError, match=message) as caught:
-        load_weights(path)
-    assert "weights.json" in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_a_byte_order_mark_is_taken(tmp_path):
-    path = tmp_path / "weights.json"
-    save_weights(path, expert())
-    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
-    jax.tree.map(np.testing.assert_array_equal, load_weights(path), expert())
-
-
-@pytest.mark.parametrize("text", ["", "{", "[1]", "\udc80", '{"Q": 1, "Q": 2}', "[" * 100_000])
-def test_weights_that_are_no_json_object_are_refused(tmp_path, text):
-    path = tmp_path / "weights.json"
-    path.write_bytes(text.encode(errors="surrogateescape"))
-    with pytest.raises(ValueError, match="weights.json: ") as caught:
-        load_weights(path)
-    assert "\n" not in str(caught.value)
-
-
 @pytest.fixture
 def edited(tmp_path, monkeypatch):
     """Changes the text of a module of the package, as far as `code_hash` can see."""
@@ -303,38 +169,7 @@ def edited(tmp_path, monkeypatch):
     ],
 )
 def test_a_result_holds_for_the_code_that_computes_it(edited, module, before, after, same):
-    hashes = (
-        environment.code_hash("sim.walk"),
-        code_hash("tuning.difftune", "grfm.network"),
-    )
+    hashes = (environment.code_hash("sim.walk"), code_hash("tuning.difftune", "grfm.network"))
     edited(module, before, after)
-    again = (
-        environment.code_hash("sim.walk"),
-        code_hash("tuning.difftune", "grfm.network"),
-    )
+    again = (environment.code_hash("sim.walk"), code_hash("tuning.difftune", "grfm.network"))
     assert [a == b for a, b in zip(hashes, again, strict=True)] == [same, same]
-
-
-@pytest.mark.parametrize(("package", "same"), [("jax", False), ("numpy", False), ("flax", True)])
-def test_a_result_holds_for_the_packages_that_compute_it(monkeypatch, package, same):
-    before = environment.code_hash("sim.walk")
-    installed = environment.version
-    others = lambda name: "0.0.1" if name == package else installed(name)  # noqa: E731
-    environment.code_hash.cache_clear()
-    monkeypatch.setattr(environment, "version", others)
-    assert (environment.code_hash("sim.walk") == before) is same
-    environment.code_hash.cache_clear()
-
-
-def test_the_environment_is_plain_words_without_folders():
-    found = environment.environment()
-    assert json.loads(json.dumps(found)) == found
-    assert {"python", "jax", "mujoco", "platform", "device"} <= found.keys()
-    assert found["precision"] == "float64"
-    assert not any("/" in value for value in found.values())
-
-
-def test_a_folder_that_is_no_checkout_has_no_commit(tmp_path):
-    assert environment._commit(tmp_path) == ""
-    (tmp_path / ".git").mkdir()
-    assert environment._commit(tmp_path) == ""

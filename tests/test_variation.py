@@ -27,12 +27,7 @@ from hector_jax.tuning.rollout import (
     rollout_config,
     with_variation,
 )
-from hector_jax.tuning.variation import (
-    drawn_variation,
-    estimate_error,
-    moved_by,
-    within_friction,
-)
+from hector_jax.tuning.variation import drawn_variation, estimate_error, moved_by, within_friction
 from hector_jax.tuning.variation import no_variation as as_believed
 
 ROBOT = load_robot()

@@ -1,16 +1,14 @@
 """A run on a page: what is drawn is what was walked, and a growing run is seen to grow."""
 
 import signal
-import socket
 import subprocess
 import sys
 import time
 
-import jax
 import numpy as np
 import pytest
 from browser import CHROMIUM, opened
-from pretend import elsewhere, pretend_history, pretend_walk
+from pretend import elsewhere, instead, pretend_history, pretend_walk
 
 from hector_jax.cli import arguments
 from hector_jax.cli.flags import Tune
@@ -20,7 +18,6 @@ from hector_jax.control.weights import expert, nominal, weights_to_vector
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core import inputs
 from hector_jax.core.files import write_json
-from hector_jax.core.inputs import InputError
 from hector_jax.report import pictures, view
 from hector_jax.report.motion import motion
 from hector_jax.report.view import ViewedWalk, arrows
@@ -102,13 +99,6 @@ def test_wrenches_of_the_yaw_frame_are_turned_into_the_world(robot):
     np.testing.assert_allclose(drawn, 5 / 6 * np.array(ahead), atol=1e-9)
 
 
-def test_each_touchdown_leaves_one_sole_of_the_feet_length(robot):
-    found = motion(robot, *viewed(seconds=4.0))
-    assert len(found.soles) == 20
-    length = np.linalg.norm(found.soles[:, 1] - found.soles[:, 0], axis=1)
-    np.testing.assert_allclose(length, robot.toe + robot.heel)
-
-
 def test_both_walks_stand_on_one_reference_wherever_they_began(robot):
     one = viewed(seconds=0.5, turn=1.0)
     found = motion(robot, *one)
@@ -132,22 +122,6 @@ def test_metrics_are_read_back_as_they_were_written(tmp_path):
     assert curve[6] < curve[0]
 
 
-def test_a_line_that_is_being_written_is_left_for_later(tmp_path):
-    write_metrics(tmp_path, 4)
-    whole = runs.read_histories(tmp_path)
-    with (tmp_path / "metrics.jsonl").open("a") as file:
-        file.write('{"set": "with", "itera')
-    assert len(runs.read_histories(tmp_path)["with"]) == len(whole["with"])
-
-
-def test_a_damaged_line_is_named(tmp_path):
-    write_metrics(tmp_path, 4)
-    text = (tmp_path / "metrics.jsonl").read_text().replace('"iteration": 2', '"number": 2', 1)
-    (tmp_path / "metrics.jsonl").write_text(text)
-    with pytest.raises(ValueError, match=r"metrics.jsonl, line 3: an iteration .*'iteration'"):
-        runs.read_histories(tmp_path)
-
-
 def test_a_run_that_goes_on_lends_its_newest_weights(tmp_path):
     run = pretend_run(tmp_path)
     weights, told = runs.weights_of(run, "with")
@@ -157,13 +131,6 @@ def test_a_run_that_goes_on_lends_its_newest_weights(tmp_path):
     weights, told = runs.weights_of(run, "with")
     np.testing.assert_array_equal(weights_to_vector(weights), weights_to_vector(expert()))
     assert told == "with"
-
-
-def test_an_unknown_set_is_told_those_that_there_are(tmp_path):
-    run = pretend_run(tmp_path, weights=["with_walks"])
-    expected = "no weight set 'witth'; it has expert, nominal, with, with_walks, without"
-    with pytest.raises(ValueError, match=expected):
-        runs.weights_of(run, "witth")
 
 
 def refused(monkeypatch, capsys, *arguments):
@@ -183,28 +150,11 @@ def test_what_is_no_run_is_refused_in_one_line(monkeypatch, capsys, tmp_path):
     )
 
 
-def test_a_run_is_not_filmed_into_its_own_folder(monkeypatch, capsys, tmp_path):
-    line = refused(monkeypatch, capsys, pretend_run(tmp_path), "--out", tmp_path)
-    assert "--out must not be the folder of the run" in line
-
-
-def test_two_different_sets_are_asked_for(monkeypatch, capsys, tmp_path):
-    run = pretend_run(tmp_path)
-    line = refused(monkeypatch, capsys, run, "--headless", "--sets", "with", "with")
-    assert "--sets names 'with' twice" in line
-
-
-def test_a_missing_viser_is_told_with_the_extra_that_has_it(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(inputs, "find_spec", lambda name: None)
-    line = refused(monkeypatch, capsys, pretend_run(tmp_path))
-    assert "pip install 'hector-jax[view]'" in line
-
-
 def test_headless_writes_film_and_pictures_instead(monkeypatch, capsys, tmp_path):
     filmed = []
     for write in ("write_film", "write_strip"):
         monkeypatch.setattr(pictures, write, lambda *film: filmed.append(film))
-    monkeypatch.setattr(arguments, "walk_once", lambda *_: pretend_walk(seconds=0.3))
+    instead(monkeypatch, arguments, "walk_once", lambda *_: pretend_walk(seconds=0.3))
     monkeypatch.setattr(inputs, "find_spec", lambda name: None)  # needs no viser
     run, out = pretend_run(tmp_path / "run"), tmp_path / "out"
     flags = ["--world", "srbm", "--sets", "nominal", "expert"]
@@ -226,90 +176,6 @@ def page(robot, model, tmp_path):
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
     yield view.Page(server, motions, model, run, "a story"), run, motions
     server.stop()
-
-
-def test_a_page_plays_from_start_to_end_and_again(robot, page):
-    page, _, motions = page
-    page._speed.value = 1.0
-    page.advance(0.5)
-    assert page._time.value == pytest.approx(0.5)
-    trunk, walked = page._handles[0]["bodies"][1], motions["before"]
-    np.testing.assert_allclose(trunk.position, walked.qpos[49, :3])
-    np.testing.assert_allclose(trunk.wxyz, walked.qpos[49, 3:7])
-    apart = np.linalg.norm(trunk.position - walked.path[49])
-    np.testing.assert_allclose(apart, np.linalg.norm(robot.com_offset), atol=1e-9)
-    assert "fell" not in page._handles[1]["name"].text
-    page.advance(0.3)
-    assert page._handles[1]["name"].text == "after, fell at 0.60 s"
-    page.advance(0.9)
-    assert page._time.value == pytest.approx(1.0)
-    page.advance(0.1)
-    assert page._time.value == 0.0
-
-
-def test_a_page_that_is_paused_stands_still(page):
-    page, _, _ = page
-    page.advance(0.3)
-    page._play(False)
-    before = page._time.value
-    page.advance(0.3)
-    assert page._time.value == before
-    assert page._button.label == "Play"
-
-
-def test_what_is_unchecked_is_not_drawn(page):
-    page, _, _ = page
-    drawn = {key: handle for key, (handle, _) in page._handles[0]["arrows"].items()}
-    assert drawn["force", "measured"].visible
-    assert not drawn["moment", "measured"].visible
-    page._boxes["measured"].value = False
-    page._boxes["moment"].value = True
-    page._tick = -1
-    page.advance(0.0)
-    assert not drawn["force", "measured"].visible
-    assert drawn["force", "commanded"].visible
-
-
-def test_the_curves_grow_with_the_run(page):
-    page, run, _ = page
-    assert len(page._losses.data[0]) == 13
-    assert "the run goes on" in page._progress.content
-    write_metrics(run, 20)
-    page.advance(0.5)
-    assert len(page._losses.data[0]) == 13  # not looked at yet
-    page.advance(0.6)
-    assert len(page._losses.data[0]) == 21
-    assert [line["label"] for line in page._losses.series] == ["iteration", "without", "with"]
-    assert "with: iteration 20" in page._progress.content
-    assert "the run goes on" in page._progress.content
-    write_json(run / "result.json", {})
-    page.advance(1.1)
-    assert "the run is done" in page._progress.content
-
-
-def test_a_taken_port_is_passed_by():
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        assert view._free_port("127.0.0.1", port) not in (0, port)
-
-
-def test_an_address_that_cannot_be_listened_on_is_refused():
-    with pytest.raises(InputError, match=r"cannot listen on 203"):
-        view._free_port("203.0.113.7", 8080)
-
-
-def test_the_address_is_told_before_anything_is_walked(model, tmp_path):
-    pytest.importorskip("viser", reason="viser, of the extra view, is not installed")
-    told = []
-
-    def walk():
-        told.append("walking")
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        view.serve(walk, model, tmp_path, told.append, host="127.0.0.1", port=0)
-    assert told[0].startswith("http://127.0.0.1:")
-    assert told[1:] == ["walking"]
 
 
 def _until(seconds, look):
@@ -365,12 +231,3 @@ def test_a_browser_shows_the_run_until_it_is_interrupted(tmp_path):
     *said, last = err.splitlines()  # from after the address on, as far as the pipe was not yet read
     assert (out, last) == ("", "hector: interrupted")
     assert all(line.startswith(("walking in hfs", "  before: ", "  after: ")) for line in said)
-
-
-def test_numbers_tuned_beside_the_weights_are_in_metrics(tmp_path):
-    history = pretend_history(3, refused=(2,), turn_lead=0.0, footstep_feedback=0.12)
-    (tmp_path / "metrics.jsonl").write_text("".join(runs.as_line("with", i) for i in history))
-    (again,) = runs.read_histories(tmp_path).values()
-    for one, other in zip(again, history, strict=True):
-        jax.tree.map(np.testing.assert_allclose, one.weights, other.weights)
-        jax.tree.map(np.testing.assert_allclose, one.evaluation.gradient, other.weights)

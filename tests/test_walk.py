@@ -1,7 +1,6 @@
 """The closed loop in MuJoCo C."""
 
 from functools import partial
-from types import SimpleNamespace
 
 import jax
 import mujoco
@@ -9,15 +8,12 @@ import numpy as np
 import pytest
 from model import OTHERS
 
-from hector_jax.control.controller import Plan, WalkConfig
+from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.runtime import workers
-from hector_jax.core.trajectory import State, Wrench
-from hector_jax.core.tree import layout, pack, unpack
 from hector_jax.robot.model import load_robot
-from hector_jax.sim import walk as walks
-from hector_jax.sim.loop import Job, Sample, first_tick
+from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk, walk_many
@@ -133,18 +129,6 @@ def test_a_seed_gives_the_same_bytes():
     assert first.tobytes() != other.tobytes()
 
 
-def test_what_is_packed_comes_back_with_its_shapes_and_types():
-    given = {
-        "a": np.arange(6.0).reshape(2, 3),
-        "b": (np.array(7, np.int32), np.array([True, False])),
-    }
-    for one, other in zip(
-        jax.tree.leaves(unpack(layout(given), pack(given))), jax.tree.leaves(given), strict=True
-    ):
-        assert one.dtype == other.dtype
-        np.testing.assert_array_equal(one, other)
-
-
 def test_a_fall_is_held_and_marked():
     ice = ideal()._replace(floor_friction=np.array(0.11))
     fall = walk(CONFIG, ROBOT, Job(expert(), named_command("s"), ice, seconds=3.0))
@@ -154,23 +138,6 @@ def test_a_fall_is_held_and_marked():
     for leaf in jax.tree.leaves(fall._replace(period=None, initial=None, fallen=None)):
         assert np.isfinite(leaf).all()
         assert (leaf[first:] == leaf[max(first - 1, 0)]).all()
-
-
-@pytest.mark.parametrize("after", [-1100, 0, 1, 4])
-def test_from_a_fall_on_the_sample_before_it_is_repeated(monkeypatch, after):
-    """A fall in the start-up, or that many milliseconds after t = 0."""
-    lead = 10 * -first_tick(CONFIG)
-    at, fell = np.arange(lead + 50.0), max(lead + after, 0)
-    zero, good = np.zeros_like(at), max(fell - 1, 0)
-    state = State(*(at[:, None] * np.ones(3) for _ in range(4)))
-    sample = Sample(state, state, Wrench(zero, zero), zero, at, at >= fell, at >= fell)
-    plan = Plan(Wrench(zero, zero), zero, None, None, zero, None)
-    monkeypatch.setattr(walks, "_walk_blocks", lambda *_, **__: iter([(plan, sample)]))
-    sound = SimpleNamespace(broken=False)
-    job = Job(expert(), named_command("straight"), ideal(), seconds=0.05)
-    walked = walk(CONFIG, ROBOT, job, build=lambda *_: sound)
-    np.testing.assert_array_equal(walked.joints, np.minimum(at[lead:], good))
-    np.testing.assert_array_equal(walked.fallen, at[lead:] > good)
 
 
 class Breaks(MujocoPlant):
@@ -197,12 +164,6 @@ def test_a_plant_that_breaks_ends_the_walk_a_tick_before(short):
     assert (walked.joints[30:] == short.joints[29]).all()
 
 
-def test_every_sample_can_be_watched(watched):
-    _, times = watched
-    np.testing.assert_allclose(times, 0.001 * np.arange(1, len(times) + 1))
-    assert len(times) == 1100 + 500
-
-
 def test_a_walk_may_start_at_another_phase():
     job = Job(expert(), named_command("c"), ideal(), 0.2)
     late = walk(CONFIG, ROBOT, job._replace(start_tick=10))
@@ -211,11 +172,6 @@ def test_a_walk_may_start_at_another_phase():
     np.testing.assert_allclose(start[:2], late.initial.position[:2], atol=1e-6)
     with pytest.raises(ValueError, match="start_tick -110 is not later"):
         walk(CONFIG, ROBOT, job._replace(start_tick=-110))
-
-
-def test_a_walk_shorter_than_a_tick_is_refused():
-    with pytest.raises(ValueError, match="at least one tick"):
-        walk(CONFIG, ROBOT, Job(expert(), named_command("c"), ideal(), seconds=0.0))
 
 
 @pytest.mark.slow

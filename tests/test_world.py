@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from hector_jax.robot.description import Description
 from hector_jax.robot.model import load_robot, quiet_mujoco
 from hector_jax.sim.actuators import init_actuators, step_actuators
 from hector_jax.sim.standin import standin
@@ -24,7 +23,6 @@ from hector_jax.sim.world import (
     hfs_varied,
     hfs_with_motors,
     ideal,
-    named_world,
     noisy,
     push_force,
     standing_qpos,
@@ -79,12 +77,6 @@ def test_a_push_lasts_from_its_start_on_and_pushes_add_up():
     np.testing.assert_array_equal(felt[:, 0], np.where((at >= 100) & (at < 200), 10.0, 0.0))
     np.testing.assert_array_equal(felt[:, 1], np.where((at >= 150) & (at < 160), 5.0, 0.0))
     assert not np.any(push_force(NO_PUSH, jnp.array(0)))
-
-
-def test_what_is_only_looked_at_is_no_part_of_a_world():
-    model = build_world(hfs()).model
-    assert np.all(model.geom_contype | model.geom_conaffinity)
-    assert (model.ngeom, model.ntex, model.nmat) == (12, 0, 0)
 
 
 def test_joints_are_found_by_name_with_and_without_backlash():
@@ -280,20 +272,6 @@ def test_a_wrong_number_is_refused_by_name():
     for name, value in (("joint_friction", -1.0), ("mass", 0.0), ("delay", 0.1), ("lag", np.nan)):
         with pytest.raises(ValueError, match=f"Imperfections.{name}"):
             build_world(ideal()._replace(**{name: np.array(value)}))
-
-
-def test_an_unknown_world_is_refused():
-    known = "ideal, hfs, hfs-varied, hfs-even"
-    with pytest.raises(ValueError, match=f"unknown world 'mars'; known: {known}"):
-        named_world("mars")
-
-
-def test_a_broken_file_is_refused_in_one_line(tmp_path):
-    broken = tmp_path / "broken.xml"
-    broken.write_text("<mujoco><worldbody>")
-    with pytest.raises(ValueError, match="broken.xml") as caught:
-        build_world(ideal(), Description(broken))
-    assert "\n" not in str(caught.value)
 
 
 def test_a_blown_up_state_stays_blown_up_and_leaves_no_log(tmp_path, monkeypatch):
