@@ -74,7 +74,7 @@ def next_walk(folder, names=("ahead", "aside", "back"), start="nominal"):
     if not (folder / "config.json").exists():
         files = tuple(f"{name}.toml" for name in names)
         flags = {"traj": files, "start": start, "tune": ("foot_height",)}
-    propose.propose(Propose(folder, json=True, **flags))
+    propose.run_propose(Propose(folder, json=True, **flags))
 
 
 def drawn(robot, name, error=0.002, fall_at=None, seconds=SECONDS, place=(0.0, 0.0)):
@@ -119,7 +119,7 @@ def carded(folder, robot, name, path=None, *, weights=None, number=0, card=None,
 
 
 def report(folder, *logs, **flags):
-    propose.report(Report(folder, logs, json=True, **flags))
+    propose.run_report(Report(folder, logs, json=True, **flags))
 
 
 def content(folder):
@@ -199,7 +199,7 @@ def test_a_log_with_a_damaged_card_is_refused(folder, robot, at):
 def test_what_a_campaign_cannot_do_now_is_one_line(folder, robot):
     next_walk(folder, ("ahead",))
     with pytest.raises(InputError, match="begun with --traj ahead.toml, got s"):
-        propose.propose(Propose(folder, ("s",)))
+        propose.run_propose(Propose(folder, ("s",)))
     log = carded(folder, robot, "ahead")
     report(folder, log)
     refused(folder, "no walk is waited for", log)
@@ -369,7 +369,7 @@ def test_the_log_of_a_walk_with_the_proposed_file_is_taken(folder, robot, capsys
     )
 
     def walk(weights, **flags):
-        evaluate.walk(Walk(traj="ahead.toml", weights=weights, out=Path("log.npz"), **flags))
+        evaluate.run_walk(Walk(traj="ahead.toml", weights=weights, out=Path("log.npz"), **flags))
         return "log.npz"
 
     next_walk(folder, ("ahead",), start="uneven.json")

@@ -273,21 +273,21 @@ def line(*words):
 
 def test_what_changes_no_number_stays_as_it_was_unless_another_is_given(asked):
     own = {"traj": ("c",), "seeds": 3, "video": False, "json": True, "processes": 1}
-    command.tune(flags.Tune(out=Path("run"), **own))
-    command.tune(flags.Tune(resume=Path("run")))
+    command.run_tune(flags.Tune(out=Path("run"), **own))
+    command.run_tune(flags.Tune(resume=Path("run")))
     assert {name: getattr(asked[-1][1], name) for name in own} == own
-    command.tune(flags.Tune(resume=Path("run"), processes=3))
+    command.run_tune(flags.Tune(resume=Path("run"), processes=3))
     assert asked[-1][1].processes == 3
 
 
 def test_a_run_whose_data_are_elsewhere_is_refused_at_once(asked, tmp_path, monkeypatch):
-    command.tune(flags.Tune(traj=("c",), out=tmp_path / "run"))
+    command.run_tune(flags.Tune(traj=("c",), out=tmp_path / "run"))
     (tmp_path / "other").mkdir()
     monkeypatch.chdir(tmp_path / "other")
     with pytest.raises(InputError, match=f"^data: no data here; the run was begun in {tmp_path}: "):
-        command.tune(flags.Tune(resume=tmp_path / "run"))
+        command.run_tune(flags.Tune(resume=tmp_path / "run"))
     assert not Path("data").exists()
-    command.tune(flags.Tune(resume=tmp_path / "run", data=tmp_path / "data"))
+    command.run_tune(flags.Tune(resume=tmp_path / "run", data=tmp_path / "data"))
     assert len(asked) == 2
 
 
@@ -303,28 +303,28 @@ def test_a_run_whose_data_are_elsewhere_is_refused_at_once(asked, tmp_path, monk
 )
 def test_another_configuration_is_not_taken_up(asked, given, message):
     own = {"seeds": 3, "smooth": 2.0, "start": "expert", "traj": ("c",)}
-    command.tune(flags.Tune(out=Path("run"), **own))
+    command.run_tune(flags.Tune(out=Path("run"), **own))
     before = files(Path("run"))
     with pytest.raises(ValueError, match=message):
-        command.tune(line("--resume", "run", *given))
+        command.run_tune(line("--resume", "run", *given))
     assert len(asked) == 1
     assert files(Path("run")) == before
 
 
 def test_a_run_of_other_code_another_robot_or_none_is_not_taken_up(asked, monkeypatch):
-    command.tune(flags.Tune(traj=("c",), out=Path("run")))
+    command.run_tune(flags.Tune(traj=("c",), out=Path("run")))
     again = flags.Tune(resume=Path("run"))
     with monkeypatch.context() as patch:
         patch.setattr(run_folder, "code_hash", lambda *modules: "another")
         with pytest.raises(InputError, match="run: begun with other code or other versions"):
-            command.tune(again)
+            command.run_tune(again)
     with monkeypatch.context() as patch:
         other = ROBOT._replace(mass=np.asarray(13.0))
         patch.setattr(run_folder, "load_robot", lambda path=None: other)
         with pytest.raises(ValueError, match="run: begun with robot"):
-            command.tune(again)
+            command.run_tune(again)
     with pytest.raises(ValueError, match="none/config.json: cannot read a file of a run of"):
-        command.tune(flags.Tune(resume=Path("run/none")))
+        command.run_tune(flags.Tune(resume=Path("run/none")))
 
 
 def test_a_run_of_another_trajectory_is_not_taken_up(tmp_path):
@@ -343,15 +343,15 @@ def test_runs_of_the_same_second_have_folders_of_their_own(asked, tmp_path, monk
 
     monkeypatch.setattr(run_folder, "datetime", Clock)
     for _ in range(3):
-        command.tune(flags.Tune(traj=("s",), runs=tmp_path))
+        command.run_tune(flags.Tune(traj=("s",), runs=tmp_path))
     names = [folder.name for folder, _ in asked]
     assert names == ["20261121-093459", "20261121-093500", "20261121-093501"]
 
 
 def test_several_trajectories_are_one_run(asked):
-    command.tune(flags.Tune(traj=("all",), runs=Path("runs")))
-    command.tune(flags.Tune(traj=("c", "all"), out=Path("out")))
-    command.tune(flags.Tune(resume=Path("out")))
+    command.run_tune(flags.Tune(traj=("all",), runs=Path("runs")))
+    command.run_tune(flags.Tune(traj=("c", "all"), out=Path("out")))
+    command.run_tune(flags.Tune(resume=Path("out")))
     (auto, first), (named, second), again = asked
     assert auto.parent == Path("runs/straight-c-s")
     assert first.traj == ("straight", "c", "s")
@@ -372,18 +372,18 @@ SHORT = 'name = "short"\n[[segment]]\nseconds = 2.0\nv_x = 0.2\n'
 def test_what_one_set_cannot_be_tuned_for_is_one_line(asked, changes, message):
     Path("short.toml").write_text(SHORT)
     with pytest.raises(InputError, match=message):
-        command.tune(flags.Tune(**changes))
+        command.run_tune(flags.Tune(**changes))
     assert {path.name for path in Path().iterdir()} == {"data", "short.toml"}
 
 
 def test_each_trajectory_of_a_file_has_a_folder_of_its_name(asked):
     Path("mine.toml").write_text(SHORT)
     several = flags.Tune(traj=("c", "mine.toml"), each=True)
-    command.tune(replace(several, out=Path("out")))
-    command.tune(replace(several, resume=Path("out")))
+    command.run_tune(replace(several, out=Path("out")))
+    command.run_tune(replace(several, resume=Path("out")))
     assert [folder for folder, _ in asked] == 2 * [Path("out/c"), Path("out/short")]
     with pytest.raises(InputError, match="out: its trajectories were tuned one by one; add --each"):
-        command.tune(flags.Tune(traj=("mine.toml",), resume=Path("out")))
+        command.run_tune(flags.Tune(traj=("mine.toml",), resume=Path("out")))
 
 
 @pytest.mark.slow

@@ -36,7 +36,7 @@ from hector_jax.verdict import judging
 from hector_jax.verdict.metrics import family_of
 
 
-def weights(text: str, robot: Robot) -> Weights:
+def weights_by_name(text: str, robot: Robot) -> Weights:
     """Return a weight set by its name, or from a file.
 
     Raises:
@@ -97,7 +97,7 @@ def data_folder(folder: Path, path: Path | None, robot: Robot) -> Path:
     return named
 
 
-def robot_of(run: Path, request: RunRequest) -> Robot:
+def robot_of_run(run: Path, request: RunRequest) -> Robot:
     """Load the robot that a run was tuned for.
 
     Raises:

@@ -46,14 +46,20 @@ def run(args: Any) -> None:
     raise NotImplementedError(type(args))
 
 
-for _command in (doctor.doctor, evaluate.evaluate, evaluate.walk, evaluate.grfm, tune.tune):
+for _command in (
+    doctor.run_doctor,
+    evaluate.run_evaluate,
+    evaluate.run_walk,
+    evaluate.run_grfm,
+    tune.run_tune,
+):
     run.register(_command)
-for _command in (propose.propose, propose.report, verdict.verdict, view.view_run):
+for _command in (propose.run_propose, propose.run_report, verdict.run_verdict, view.run_view):
     run.register(_command)
 
 
 @run.register
-def collect(args: flags.Collect) -> None:
+def run_collect(args: flags.Collect) -> None:
     """Walk on the simulator with random plants and commands, and save the walks."""
     config = nets.CollectConfig(args.walks, args.seconds, args.seed, args.engine)
     robot = load_robot(args.robot)
@@ -64,7 +70,7 @@ def collect(args: flags.Collect) -> None:
 
 
 @run.register
-def train(args: flags.Train) -> None:
+def run_train(args: flags.Train) -> None:
     """Train a net on walks."""
     config = TrainConfig(args.variant, epochs=args.epochs, seed=args.seed)
     robot = load_robot(args.robot)
@@ -77,7 +83,7 @@ def train(args: flags.Train) -> None:
 
 
 @run.register
-def search(args: flags.Search) -> None:
+def run_search(args: flags.Search) -> None:
     """Search for weights on the simulator, without gradients."""
     robot = load_robot(args.robot)
     trajectories = arguments.load_trajectories([args.traj], robot)
@@ -85,7 +91,7 @@ def search(args: flags.Search) -> None:
     config = SearchConfig(args.budget, args.population, args.seed, args.spread)
     engine = choose_engine(args.engine)
     tuning = arguments.with_length(tunings.tune_config(robot), trajectories[0])
-    start = arguments.weights(args.start, robot)
+    start = arguments.weights_by_name(args.start, robot)
     out = arguments.flag_folder(args, "out", robot)
     make_folder(out)
     shared: dict[str, Any] = {"commands": commands, "engine": engine}
@@ -127,7 +133,7 @@ def _print_search(cards: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 @run.register
-def compare(args: flags.Compare) -> None:
+def run_compare(args: flags.Compare) -> None:
     """Put finished runs side by side."""
     finished = [folder for folder in args.runs if (folder / RESULT).exists()]
     for folder in args.runs:
@@ -140,7 +146,7 @@ def compare(args: flags.Compare) -> None:
 
 
 @run.register
-def examine_robot(args: flags.Robot) -> None:
+def run_robot(args: flags.Robot) -> None:
     """Check a robot's TOML, or propose one for its model.
 
     Raises:
@@ -204,14 +210,14 @@ def _write_robot(out: Path, proposal: RobotProposal, comments: Sequence[str], fi
 
 
 @run.register
-def export_controller(args: flags.Export) -> None:
+def run_export(args: flags.Export) -> None:
     """Export the controller of a run, checked against the live one."""
     is_run = args.run.is_dir()
     if is_run and args.robot:
         raise InputError(f"--robot is for weights files; the run {args.run} names its own robot")
     path, config = export.find_weights(args.run, args.set)
     request = read_request(args.run) if is_run else None
-    robot = arguments.robot_of(args.run, request) if request else load_robot(args.robot)
+    robot = arguments.robot_of_run(args.run, request) if request else load_robot(args.robot)
     text = args.traj or (request.trajectory if request else "straight")
     trajectory = arguments.load_trajectory(text, robot)
     name = f"{args.run.resolve().name}/{path.stem}" if is_run else path.stem

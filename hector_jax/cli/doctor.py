@@ -38,7 +38,7 @@ _EXTRAS = {  # name: (packages that it needs, what needs it)
 }
 
 
-def doctor(args: Doctor) -> None:
+def run_doctor(args: Doctor) -> None:
     """Report what is installed on this machine and test it.
 
     Raises:

@@ -41,7 +41,7 @@ from hector_jax.verdict import judging, metrics
 from hector_jax.walk_tuning.walk_log import walk_card
 
 
-def evaluate(args: Evaluate) -> None:
+def run_evaluate(args: Evaluate) -> None:
     """Evaluate weight sets on the plants of a world."""
     robot = arguments.with_gait(load_robot(args.robot), args.gait)
     plant = arguments.plant_of(args.plant, robot)
@@ -55,7 +55,7 @@ def evaluate(args: Evaluate) -> None:
                 raise InputError(f"{flag}: --world {args.world} is one plant without a seed")
         count = 1
     seeds = range(args.first_seed, args.first_seed + count)
-    sets = {text: arguments.weights(text, robot) for text in args.weights}
+    sets = {text: arguments.weights_by_name(text, robot) for text in args.weights}
     plants = arguments.plants(args.world, seeds, (plant or robot).description)
     config, engine = tunings.tune_config(robot), choose_engine(args.engine)
     with workers(args.processes) as pool:
@@ -85,7 +85,7 @@ def evaluate(args: Evaluate) -> None:
     print_result(args.json, result, print_text)
 
 
-def walk(args: Walk) -> None:
+def run_walk(args: Walk) -> None:
     """Walk once and report losses and errors.
 
     Raises:
@@ -99,7 +99,7 @@ def walk(args: Walk) -> None:
         raise InputError("--plant needs a world of MuJoCo, got --world srbm")
     if args.world == "srbm" and args.engine != "c":
         raise InputError(f"--engine {args.engine} needs a world with a plant, got --world srbm")
-    engine, weights = choose_engine(args.engine), arguments.weights(args.weights, robot)
+    engine, weights = choose_engine(args.engine), arguments.weights_by_name(args.weights, robot)
     command = arguments.load_trajectory(args.traj, robot)
     loss, config = loss_of_robot(robot.description), walk_config(robot)
     say("compiling (only the first time on a machine) and walking")
@@ -141,7 +141,7 @@ def walk(args: Walk) -> None:
         name = Path(args.weights).stem
         baseline = "expert" if name == "nominal" else "nominal"
         say(f"walking with {baseline} weights for the other half of the film")
-        walks = {baseline: walk_with(arguments.weights(baseline, robot)), name: trajectory}
+        walks = {baseline: walk_with(arguments.weights_by_name(baseline, robot)), name: trajectory}
         pictures.film(args.video, robot, walks)
 
 
@@ -159,7 +159,7 @@ def _print_walk(
         print(f"roll {roll:.1f}, pitch {pitch:.1f}, yaw {yaw:.1f} degrees")
 
 
-def grfm(args: Grfm) -> None:
+def run_grfm(args: Grfm) -> None:
     """Report the prediction errors of each net, with pictures."""
     robot, config = load_robot(), TuneConfig()
     make_folder(args.out)
@@ -217,4 +217,4 @@ def _on_stand_in(setup: Setup, count: int) -> Walks:
     title = f"walking on {plural(count, 'stand-in plant')}, for information"
     walks = judging.walk_jobs(setup, jobs, title)
     tick = setup.config.rollout.walk.gait.tick
-    return Walks(stack(jobs), stack([at_interval(walk, tick) for walk in walks]))
+    return Walks(stack(jobs), stack([at_interval(run_walk, tick) for run_walk in walks]))

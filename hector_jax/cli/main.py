@@ -18,7 +18,7 @@ from hector_jax.core.inputs import InputError, outside_packages
 try:
     with outside_packages():
         from hector_jax.cli.flags import Doctor, Export
-        from hector_jax.cli.parse import check, from_line, resolve_latest
+        from hector_jax.cli.parse import check_flags, from_line, resolve_latest
         from hector_jax.core.console import Broken, exit_code, say, say_if_slow
         from hector_jax.core.runtime import start_jax
 except InputError as error:
@@ -33,7 +33,7 @@ def main() -> int:
 
 def _run(words: Sequence[str]) -> None:
     args = resolve_latest(from_line(words))
-    check(args)
+    check_flags(args)
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # hides messages about its cache
     say_once = cache(say)  # MuJoCo repeats what it finds in a robot's file each time it reads it
     warnings.showwarning = lambda message, *where, **_: say_once(f"warning: {message}")

@@ -230,7 +230,7 @@ def as_command(program: str, flags: Any) -> str:
 # The checks
 
 
-def check(flags: Any) -> None:
+def check_flags(flags: Any) -> None:
     """Check the types and ranges of flags, and that the files that they name exist.
 
     Raises:

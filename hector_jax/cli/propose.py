@@ -25,7 +25,7 @@ from hector_jax.walk_tuning import reported_walks, walk_log, walks
 from hector_jax.walk_tuning.campaign import Campaign
 
 
-def propose(args: Propose) -> None:
+def run_propose(args: Propose) -> None:
     """Propose the next weights to walk with, the same ones until their walk is reported."""
     path = args.folder / CONFIG
     if path.exists():
@@ -55,7 +55,7 @@ def propose(args: Propose) -> None:
     print_result(args.json, result, print_text)
 
 
-def report(args: Report) -> None:
+def run_report(args: Report) -> None:
     """Read the logs of the walks with the proposed weights and evaluate them, or undo that."""
     path = args.folder / CONFIG
     if not path.exists():
@@ -167,7 +167,7 @@ def _campaign(args: Propose) -> Campaign:
     config = arguments.with_length(config, trajectories[0])
     begun = (args.folder / CONFIG).exists()  # from weights that --start may no longer name
     start = str(walks.weights_path(args.folder, 0)) if begun else args.start
-    start = arguments.weights(start, robot)
+    start = arguments.weights_by_name(start, robot)
     commands = {trajectory.name: trajectory.command for trajectory in trajectories}
     return Campaign(
         args.folder,

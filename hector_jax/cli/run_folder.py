@@ -57,7 +57,7 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
         walks = f"{plural(count, 'command')} on {plural(plants, 'plant')}, twice"
         raise InputError(f"--walks must be 0 or at least {least} ({walks}), got {args.walks}")
     choose_engine(args.walk_engine)  # whether it is installed
-    start, of_legs = arguments.weights(args.start, robot), leg_numbers(args.tune)
+    start, of_legs = arguments.weights_by_name(args.start, robot), leg_numbers(args.tune)
     if of_legs and not args.walks:
         text = "only --walks can tune what the rigid-body model does not have"
         raise InputError(f"--tune {' '.join(of_legs)}: {text}")

@@ -51,7 +51,7 @@ from hector_jax.walk_tuning.walks import Campaign, Row, candidates, changes_by_w
 _ARTEFACTS = "kept"  # folder in it
 
 
-def tune(args: Tune) -> None:
+def run_tune(args: Tune) -> None:
     """Tune one weight set for all trajectories, or one for each, in new or resumed runs."""
     if args.out and args.resume:
         raise InputError(f"--out {args.out} and --resume {args.resume}: only one can be given")
@@ -64,7 +64,7 @@ def tune(args: Tune) -> None:
     else:
         for folder, flags in runs.items():
             run_folder.trajectories(flags, robot)
-            arguments.weights(flags.start, robot)
+            arguments.weights_by_name(flags.start, robot)
             if base and folder.exists():
                 raise run_folder.exists_error(folder)
         runs = {run_folder.begin(folder, flags): flags for folder, flags in runs.items()}
@@ -130,7 +130,7 @@ def _begin(pool: Executor, folder: Path, args: Tune, commit: str) -> _Run:
     trajectories = run_folder.trajectories(args, robot)
     config = tunings.tune_config(robot, iterations=args.iterations, others=model_numbers(args.tune))
     config = arguments.with_length(config, trajectories[0])
-    start = arguments.weights(args.start, robot)
+    start = arguments.weights_by_name(args.start, robot)
     data = arguments.data_folder(args.data, args.robot, robot)
     net = nets.load_trained(args.net, robot, args.variant)[0] if args.net else None
     setup = Setup(pool, config, robot, commit)

@@ -57,7 +57,7 @@ class VerdictPlan(NamedTuple):
         return {name: engine.differs for name, engine in self.engines.items() if engine.differs}
 
 
-def verdict(args: Verdict) -> None:
+def run_verdict(args: Verdict) -> None:
     """Walk weight sets in several engines and models, and report which claims hold."""
     plan = plan_of(args)
     say(_plan_text(plan))
@@ -155,7 +155,7 @@ def _sets(
 
     def load(path: Path, trajectory: str) -> Weights:
         file = path / f"{trajectory}.json" if path.is_dir() else path
-        return arguments.weights(str(file), robot)
+        return arguments.weights_by_name(str(file), robot)
 
     return {
         trajectory: {name: load(path, trajectory) for name, path in paths.items()}

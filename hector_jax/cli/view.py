@@ -21,7 +21,7 @@ from hector_jax.store.folder import read_histories, read_request, weights_of
 from hector_jax.verdict import metrics
 
 
-def view_run(args: View) -> None:
+def run_view(args: View) -> None:
     """Show a run on a page, or write its film and pictures."""
     folder = args.out or (args.run / "view" if args.headless else None)
     if folder is None:
@@ -29,7 +29,7 @@ def view_run(args: View) -> None:
     else:
         check_film(folder / "film.mp4")
     request = read_request(args.run)
-    robot = arguments.robot_of(args.run, request)
+    robot = arguments.robot_of_run(args.run, request)
     command = arguments.load_trajectory(request.trajectory, robot)
     if folder is not None:
         if folder.resolve() == args.run.resolve():
