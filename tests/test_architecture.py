@@ -4,6 +4,7 @@ import ast
 import importlib.util
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -117,6 +118,35 @@ def test_of_the_scripts_only_those_with_verdicts_reach_the_stand_in():
     }
     experiments = {f"experiments.{name}" for name in ("robustness", "batch", "pictures")}
     assert knowing == experiments | {"benchmarks.golden"}
+
+
+def definitions(path):
+    kinds = ast.FunctionDef | ast.ClassDef
+    return (node for node in ast.parse(path.read_text()).body if isinstance(node, kinds))
+
+
+def test_a_public_name_stands_in_one_module():
+    """But for the functions of each phi, flags of commands, and what a process runs."""
+    found = Counter(
+        node.name
+        for path in ROOT.rglob("*.py")
+        for node in definitions(path)
+        if not node.name.startswith("_")
+    )
+    phi, of_flags = {"init", "fit", "apply", "with_statistics"}, {"Robot", "Verdict", "View"}
+    assert {name for name, count in found.items() if count > 1} == phi | of_flags | {"main"}
+
+
+def test_a_function_takes_at_most_five_positional_arguments():
+    many = [
+        f"{path.name}: {node.name}"
+        for path in ROOT.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef)
+        if len([a for a in node.args.posonlyargs + node.args.args if a.arg not in ("self", "cls")])
+        > 5
+    ]
+    assert many == []
 
 
 def test_the_package_imports_no_script():

@@ -137,8 +137,8 @@ def test_the_loss_by_iteration_shows_refused_steps_that_are_no_numbers(tmp_path,
 def test_bars_are_the_weights_over_the_nominal_ones(tmp_path, drawn):
     nominal = np.geomspace(1e-4, 100, len(weight_names()))
     sets = {"nominal": nominal, "without": 2 * nominal, "with": nominal / 4}
-    plots.save_weights(tmp_path / "few.png", weight_names(), sets)
-    plots.save_weights(tmp_path / "all.png", weight_names(), sets | {"expert": 3 * nominal})
+    plots.save_weight_bars(tmp_path / "few.png", weight_names(), sets)
+    plots.save_weight_bars(tmp_path / "all.png", weight_names(), sets | {"expert": 3 * nominal})
     tops = [bar.get_y() + bar.get_height() for bar in drawn[0].axes[0].patches]
     np.testing.assert_allclose(tops, [2.0] * 24 + [0.25] * 24)
     np.testing.assert_allclose(lines(drawn[1].axes[0])["expert"][:, 1], 3.0)

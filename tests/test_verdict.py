@@ -135,7 +135,7 @@ def test_the_report_has_a_page_its_numbers_and_a_picture(tmp_path, drawn):
     cells = {(c, t): cell(4) for c in (C, HEAVY, DRAKE) for t in ("straight", "s")}
     cells[HEAVY, "s"] = fell
     facts = {"config": {}, "environment": {"python": "3"}, "command": "hector verdict"}
-    report.write_report(
+    report.write_verdict_report(
         tmp_path, cells, family="even", differs={"drake": "dry friction is smooth"}, **facts
     )
     page = (tmp_path / "report.md").read_text()

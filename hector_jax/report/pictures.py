@@ -52,11 +52,12 @@ def of_run(
     histories = {name: tunings[name].iterations for name in ("without", "with")}
     path, tick = folder / "pictures", config.rollout.walk.gait.tick
     path.mkdir(exist_ok=True)
+    names = weight_names(sets["nominal"])
     captions = {
         "tracking": plots.save_tracking(path / "tracking.png", walks),
         "path": plots.save_path(path / "path.png", walks),
         "losses": plots.save_losses(path / "losses.png", config.loss, histories),
-        "weights": plots.save_weights(path / "weights.png", weight_names(sets["nominal"]), vectors),
+        "weights": plots.save_weight_bars(path / "weights.png", names, vectors),
         "wrenches": plots.save_wrenches(path / "wrenches.png", tick, ground),
         "training": plots.save_training(path / "training.png", training),
     }

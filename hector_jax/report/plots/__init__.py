@@ -178,7 +178,7 @@ def save_losses(path: Path, loss: Loss, histories: Mapping[str, Sequence[Iterati
     return caption("losses")
 
 
-def save_weights(
+def save_weight_bars(
     path: Path, names: Sequence[str], sets: Mapping[str, Float[np.ndarray, " weights"]]
 ) -> str:
     """Draw tuned weights as ratios to the nominal ones.
