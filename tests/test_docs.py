@@ -262,19 +262,17 @@ def robots():
     """What the page of results says of other robots."""
     results = report("robots/robots.json")
 
-    def cell(of, world):  # `best` was `with` then, or chosen among the sets of the run
+    def cell(of, world):
         start, tuned = (of["sets"][name][world] for name in ("nominal", "best"))
         text, falls = interval(tuned["change"]["nominal"], "+"), (start["falls"], tuned["falls"])
         return (
-            text if falls == (0, 0) else f"{text}; nominal fell {falls[0]} times, tuned {falls[1]}"
+            text if falls == (0, 0) else f"{text}; nominal fell {falls[0]} times, `best` {falls[1]}"
         )
 
     names = {"go2": "Unitree Go2", "h1": "Unitree H1"}
     for robot in ("quadruped", "go2", "humanoid", "h1"):
         cells = [cell(results["all"][robot][traj], "standin-even") for traj in COMMANDS]
         yield row(names.get(robot, f"`examples/{robot}`"), *cells)
-    two = [cell(results["straight"][name]["straight"], "standin") for name in ("go2", "g1")]
-    yield f"Go2 is at {two[0]} and Unitree G1 at {two[1]} %, and nothing falls"
     plants = results["all"]["h1"]["s"]["sets"]["best"]["standin-even"]["seeds"]
     yield f"on {len(plants)} plants of `standin-even`"
 
