@@ -74,7 +74,7 @@ def _idle(config: WalkConfig, robot: Robot, weights: Weights) -> tuple[_Heading,
         command=_STILL,
         anchor=anchor,
         tick=np.int32(0),
-        memory=init_memory(robot, measurement),
+        memory=jax.eval_shape(init_memory, robot, measurement),
         measurement=measurement,
     )
     carry = _Heading(anchor.yaw, anchor, anchor.yaw), *shapes
