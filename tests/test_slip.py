@@ -70,4 +70,7 @@ def test_a_floor_that_turns_slippery_is_walked_with_less_friction():
         return np.max(np.abs(force[:, :2]).sum(axis=1) / force[:, 2])
 
     assert use(felt) < use(not_felt)
-    np.testing.assert_array_equal(felt.command.force[:1000], not_felt.command.force[:1000])
+    # two programs, which may round otherwise
+    np.testing.assert_allclose(
+        felt.command.force[:1000], not_felt.command.force[:1000], rtol=1e-9, atol=1e-9
+    )
