@@ -35,6 +35,7 @@ from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
 from hector_jax.tuning.parallel_rollout import parallel_rollout
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.tuning.status import StepStatus, Stop
+from hector_jax.tuning.variation import no_variation
 
 ROBOT = load_robot()
 ANCHOR = standing_anchor(ROBOT)
@@ -302,3 +303,44 @@ def test_on_the_rigid_body_a_batch_is_its_single_tunings():
         ours = jax.tree.map(lambda x, i=i: x[i], found)
         np.testing.assert_allclose(vector(ours.weights), vector(alone.weights), rtol=1e-9)
         np.testing.assert_allclose(ours.precision, alone.precision, rtol=1e-6, atol=1e-9)
+
+
+def test_several_scenarios_are_tuned_between_their_optima(on_toy):
+    asked = [problem(nominal(), [scenario("straight"), scenario("c")], tail) for tail in (1.0, 0.0)]
+    config = TuneConfig(iterations=60, rule="relative")  # a worst case has no smooth minimum
+    found = tune_batch(config, ROBOT, stack(asked), last_command)
+    between = 0.3 * 0.25 * np.pi / 2
+    logs = np.log(vector(found.weights) / vector(nominal()))
+    np.testing.assert_allclose(logs, between, atol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"tail": np.array([1.5])}, r"BatchProblem.tail must be from 0 to 1, got 1.5"),
+        ({"tail": np.zeros(0)}, "stacked, one per problem"),
+        ({"effect": 3}, r"BatchScenario.effect must be below 1, got 3..3"),
+        ({"scale": 0.0}, "BatchScenario.scale must be positive"),
+        (
+            {"variation": no_variation()._replace(delay=np.asarray(0.02))},
+            "Variation.delay must be from 0 to a tick of 0.01 s, got 0.02",
+        ),
+    ],
+)
+def test_impossible_problems_are_refused(wrong, told):
+    tail = wrong.pop("tail", np.ones(1))
+    asked = stack([problem(nominal(), [scenario(**wrong)])])._replace(tail=tail)
+    with pytest.raises(ValueError, match=told):
+        tune_batch(TOY, ROBOT, asked, last_command)
+
+
+@pytest.mark.slow
+def test_a_batch_with_all_ticks_at_once_is_that_of_ticks_in_turn():
+    config = TuneConfig(rollout=RolloutConfig(ticks=40), iterations=2)
+    asked = stack([problem(w, [scenario("s"), scenario("c")]) for w in STARTS[:2]])
+    in_turn, at_once = (
+        tune_batch(config, ROBOT, asked, last_command, lanes=0, walk=walk)
+        for walk in (rollout, parallel_rollout)
+    )
+    np.testing.assert_allclose(at_once.loss, in_turn.loss, rtol=1e-9)
+    np.testing.assert_allclose(vector(at_once.weights), vector(in_turn.weights), rtol=1e-7)

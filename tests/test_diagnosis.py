@@ -25,9 +25,11 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
+from hector_jax.store import tunings
 from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.verdict import judging
+from hector_jax.tuning.evaluate import Evaluation
+from hector_jax.verdict import judging, metrics
 
 ROBOT, STRAIGHT = load_robot(), named_command("straight")
 JOB = Job(nominal(), STRAIGHT, hfs(), 1.0)
@@ -198,3 +200,32 @@ def test_hector_walk_tells_the_fall_and_prints_no_nan(monkeypatch, capsys):
     assert (told["seconds"], told["fell"]) == (-0.42, True)
     assert told["fall"] == FALL._asdict()
     assert told["rms_position"] == [None] * 3
+
+
+def test_torques_of_a_robot_that_is_half_over_are_nobodys_fault():
+    record = recorded(0.0, (0.0, 0.9))
+    record.torque[record.tilt > 0.5] = 1.0
+    assert "tips over" in likeliest_cause(ROBOT, record)
+
+
+def test_a_start_that_falls_on_the_model_is_refused_before_anything_is_collected(monkeypatch):
+    zero = np.zeros(())
+    fell = Evaluation(zero, {}, nominal(), fallen=np.ones(()), residual=zero)
+    monkeypatch.setattr(tunings.difftune, "tune_step", lambda *args, **model: fell)
+    problem = tunings.Problem((named_command("straight"),), None)
+    with pytest.raises(InputError, match="the robot fell .try a slower or shorter trajectory"):
+        tunings._prepare_tuning(TuneConfig(), ROBOT, nominal(), problem)
+
+
+def test_a_tuned_set_that_walks_worse_than_nominal_is_told(capsys):
+    def scored(L):
+        score = metrics.score_like()
+        score = score._replace(losses=score.losses | {"L": np.array(L)})
+        last = pretend_walk().initial
+        return [judging.ScoredWalk(score, np.array(4.0), last, "", "")]
+
+    walks = {"nominal": scored(2e6), "without": scored(3e6), "with": scored(1e6)}
+    tuning._say_worse("straight", judging.ScoredWalks(walks, {}))
+    said = capsys.readouterr().err
+    assert "straight: on the high-fidelity simulator `without` walks with L 3e6, nominal" in said
+    assert "`with`" not in said

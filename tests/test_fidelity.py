@@ -1,5 +1,7 @@
 """Errors of a phi by phase, and where a rigid body goes under recorded commands."""
 
+import json
+
 import jax
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal
 from hector_jax.grfm.dataset import at_interval, make_dataset
 from hector_jax.grfm.effect import last_command
-from hector_jax.grfm.training import errors
+from hector_jax.grfm.training import errors, errors_by_phi
 from hector_jax.report import fidelity
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.rollout import Scenario, rollout
@@ -84,3 +86,23 @@ def test_what_follows_a_fall_is_not_predicted(robot, walks):
     short = walks._replace(fallen=walks.fallen[:, :30])
     with pytest.raises(ValueError, match="30 ticks are too short to predict 40 ticks"):
         fidelity.drift(robot, last_command, short, np.zeros(1, int))
+
+
+def test_what_nothing_was_measured_of_is_null_and_a_dash(tmp_path, robot, samples, walks):
+    """No sample in the last phase, no walk that stayed up: no warning, no NaN in a file."""
+    early = samples.window.since_switch < 0.1
+    some = jax.tree.map(lambda x: x[early], samples)
+    fell = walks._replace(fallen=np.ones_like(walks.fallen))
+    effects = {"raw": last_command}
+    phis = {**effects, "measured": None}
+    found = fidelity.as_result(
+        errors_by_phi(effects, some),
+        fidelity.by_phase(effects, some),
+        {n: fidelity.drift(robot, e, fell, np.zeros(1, int)) for n, e in phis.items()},
+    )
+    text = fidelity.write_net_report(tmp_path, {"hfs": found}, []).read_text()
+    assert "| last 50 ms, stance, F [N^2] | - |" in text
+    assert "nan" not in text
+    told = json.loads((tmp_path / "result.json").read_text())["hfs"]
+    assert told["phases"]["raw"]["last 50 ms"] == {"stance": [None] * 6, "swing": [None] * 6}
+    assert told["open_loop"]["measured"]["0.4 s"] == {"position": None, "euler": None}

@@ -1,6 +1,7 @@
 """A stored result is used again only if all that made it is the same."""
 
 import importlib.util
+import json
 import re
 import sys
 from concurrent.futures import Executor
@@ -301,3 +302,66 @@ def test_the_code_of_a_result_has_the_versions_of_all_packages_that_compute(
             assert environment.code_hash(*modules) != before, package
     version_of("msgspec")
     assert environment.code_hash(*modules) == before
+
+
+TEXT = """
+import functools
+import jax
+import numpy as np
+
+GAIN = {gain}
+TABLE = np.array([1.0, {entry}])
+
+class Scale:
+    def __call__(self, x):
+        return {scale} * x
+
+def helper(x):
+    return {inner} * x
+
+def made(factor):
+    return lambda walk: factor * walk.period
+
+@jax.jit
+def term(walk, power={power}):
+    # {comment}
+    return Scale()(helper(GAIN * walk.period ** power)) + TABLE[1]
+
+closure = made({closure})
+bound = functools.partial(helper, {bound})
+"""
+
+
+SAME = dict(gain=2.0, entry=3.0, scale=4.0, inner=5.0, power=1, closure=6.0, bound=7.0, comment="a")
+
+
+@pytest.mark.parametrize("changed", ["gain", "entry", "scale", "inner", "power"])
+def test_a_function_that_computes_something_else_is_another_one(tmp_path, changed):
+    before = module(tmp_path, TEXT.format(**SAME))
+    again = module(tmp_path, TEXT.format(**SAME | {"comment": "another"}))
+    after = module(tmp_path, TEXT.format(**SAME | {changed: 9}))
+    assert function_id(before.term) == function_id(again.term) != function_id(after.term)
+    assert function_id(before.closure) == function_id(after.closure)
+
+
+@pytest.mark.parametrize("name", ["closure", "bound"])
+def test_values_that_a_function_holds_are_of_its_content(tmp_path, name):
+    one, other = (module(tmp_path, TEXT.format(**SAME | {name: x})) for x in (6.0, 8.0))
+    assert function_id(getattr(one, name)) != function_id(getattr(other, name))
+    assert function_id(one.made) == function_id(other.made)
+
+
+@pytest.mark.parametrize("text", AROUND.values(), ids=AROUND)
+def test_a_function_of_the_user_is_seen_through_what_holds_it(tmp_path, text):
+    ids = [function_id(module(tmp_path, f"{IMPORTS}K = {k}\n{text}\n").f) for k in (2.0, 2.0, 3.0)]
+    assert ids[0] == ids[1] != ids[2]
+
+
+def test_walks_of_two_engines_are_two_collections():
+    settings = {
+        name: collection_settings(CollectConfig(engine=name), ROBOT)
+        for name in ("c", "mjx", "auto")
+    }
+    assert settings["c"] != settings["mjx"]
+    assert settings["auto"] == settings["c"]  # on a CPU
+    assert json.loads(json.dumps(settings)) == settings

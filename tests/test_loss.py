@@ -186,3 +186,8 @@ def test_terms_that_cannot_be_told_apart_are_refused():
         TuneConfig(loss=(*PAPER_LOSS, PAPER_LOSS[0]))
     with pytest.raises(InputError, match="unlike names"):
         TuneConfig(loss=(LossTerm("sway", "", 1.0, sway_loss),))
+
+
+def test_after_a_fall_a_larger_error_stays():
+    parts = parts_of(fallen_from(off_by(walk(), euler=2.0, position=2.0), 4))
+    assert parts["L_Eul"] == parts["L_pos"] == pytest.approx(10 * 6 * 3 * 4.0)

@@ -544,3 +544,11 @@ def test_u_is_packed_forces_first():
     wrench = unpack_wrench(condensed.inputs[0] @ jnp.array([1.0, 2.0, 3.0, 0.0, 5.0]))
     np.testing.assert_allclose(wrench.force, [[1, 2, 3], [0, 0, 0]])
     np.testing.assert_allclose(wrench.moment, [[0, 0, 5], [0, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"horizon": 0}, {"step_ticks": 0}, {"effort_reference": "something"}]
+)
+def test_impossible_problems_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        MpcConfig(**wrong)

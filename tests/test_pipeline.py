@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from pretend import instead
@@ -14,8 +15,11 @@ from synthetic import synthetic_walk
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import (
+    directions,
     expert,
     nominal,
+    vector_to_weights,
+    weights_to_vector,
 )
 from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import read_card
@@ -33,7 +37,7 @@ from hector_jax.store.nets import CollectConfig
 from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
-from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.rollout import RolloutConfig, Scenario
 from hector_jax.verdict.metrics import score
 from hector_jax.walk_tuning import searches
 
@@ -186,3 +190,47 @@ def test_what_a_search_is_told_is_the_loss_of_the_verdict_on_either_engine(robot
             walked = walk(WalkConfig(), robot, Job(weights, named_command(name), hfs(), 0.04))
             assert loss == pytest.approx(float(score(config.loss, walked).L), rel=1e-12)
         np.testing.assert_allclose(told["mjx"][name], told["c"][name], rtol=1e-4)
+
+
+SHARED = directions() @ directions().T  # curvature of |log(theta)|^2 / 2 in the log-steps
+
+
+def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, monkeypatch):
+    """Quadratics of the log-weights, of very different size."""
+    sizes = {"c": 1.0, "s": 1e3}
+    commands = [named_command(name)._replace(duration=np.array([k])) for name, k in sizes.items()]
+
+    def tune_step(config, scenario, weights):
+        vector = np.asarray(weights_to_vector(weights))
+        (size,) = scenario.command.duration
+        logs = np.log(vector) - (1.0 if size > 1.0 else -1.0)
+        gradient = vector_to_weights(jnp.asarray(2.0 * size * logs / vector))
+        loss = np.array(size * (logs @ logs))
+        terms = dict.fromkeys(("L_Eul", "L_pos", "L_ctrl"), loss)
+        return Evaluation(loss, terms, gradient, np.array(0.0), np.array(0.0))
+
+    def matrix(config, scenario, weights, loss, *, others):
+        return 2.0 * float(scenario.command.duration[0]) * SHARED
+
+    monkeypatch.setattr(tunings.difftune, "tune_step", tune_step)
+    monkeypatch.setattr(tunings.difftune, "gauss_newton_jit", matrix)
+    config = TuneConfig(iterations=12)
+    setup = Setup(ThreadPoolExecutor(2), config, robot)
+    for others in ((), (commands[1],)):
+        problem = tunings.Problem((commands[0], *others), None)
+        found = tunings._tune_on_cpu(setup, nominal(), problem, lambda iteration: None)
+        first = found.iterations[0].evaluation
+        scenarios = [Scenario(robot, c, None, None) for c in (commands[0], *others)]
+        each = [tune_step(config, scenario, nominal()) for scenario in scenarios]
+        mean = np.mean([one.loss for one in each])
+        assert first.loss == pytest.approx(mean, rel=1e-12)
+        scales = [one.loss / mean for one in each]
+        for i, gradient in enumerate(jax.tree.leaves(first.gradient)):
+            parts = [jax.tree.leaves(e.gradient)[i] / k for e, k in zip(each, scales, strict=True)]
+            np.testing.assert_allclose(gradient, np.mean(parts, axis=0), rtol=1e-12)
+        assert found.loss < first.loss
+        curved = [*sizes.values()][: len(scales)] / np.array(scales if others else [1.0])
+        expected = 2.0 * curved.mean() * SHARED / first.loss + config.ridge * np.eye(18)
+        np.testing.assert_allclose(found.precision, expected, rtol=1e-12)
+        if not others:  # a single one to the last bit
+            jax.tree.map(np.testing.assert_array_equal, first, each[0])

@@ -769,3 +769,69 @@ def test_residuals_have_no_slope():
 def test_shapes_that_do_not_fit_are_refused(change):
     with pytest.raises(ValueError, match="QP shapes"):
         solve_qp(small()._replace(**change))
+
+
+def test_walking_qps_in_32_bits_are_near_and_never_wrong_in_silence(walking, exact):
+    found = stack([solve(QP(*(np.float32(part) for part in qp))) for qp in walking[::5]])
+    assert found.x.dtype == jnp.float32
+    error = np.abs(found.x - exact[::5])[:, :5].max(axis=1)
+    solved = found.status == Status.SOLVED
+    assert (error <= 0.1).mean() >= 0.99
+    assert (error[solved] <= 0.1).all()
+
+
+@pytest.mark.parametrize(("small", "large"), [(1e-10, 1e10), (1e-16, 1e16), (1e-100, 1e100)])
+def test_a_curvature_counts_however_large_the_others_are(small, large):
+    for diagonal in ([small, large], [large, small]):
+        found = solve(rows(P=np.diag(diagonal), q=(-1.0, -1.0)))
+        check_solved(found)
+        np.testing.assert_allclose(found.x, 1.0 / np.array(diagonal), rtol=1e-12)
+
+
+def test_block_rows_without_bounds_change_nothing(walking):
+    for i, qp in enumerate(walking[:3]):
+        free = np.zeros(qp.A.shape[:2], bool)
+        free[i::3, 4 + i] = True
+        l, u = np.where(free.ravel(), [[-INF], [INF]], [qp.l, qp.u])  # noqa: E741
+        tangent = jax.tree.map(np.ones_like, qp)
+        entries = [np.where(free[..., None], size * qp.A, qp.A) for size in (0.0, 1.0, 1e17)]
+        found = [along(qp._replace(A=A, l=l, u=u), tangent) for A in entries]
+        check_solved(found[0][0])
+        for other in found[1:]:
+            jax.tree.map(np.testing.assert_array_equal, other, found[0])
+
+
+def test_the_problem_may_be_measured_in_any_unit(walking, walked):
+    qp = walking[7]
+    unit = np.logspace(-3, 3, qp.q.size)
+    scaled = qp._replace(
+        P=1e4 * qp.P * np.outer(unit, unit),
+        q=1e4 * qp.q * unit,
+        A=qp.A * unit.reshape(len(qp.A), 1, -1),
+    )
+    np.testing.assert_allclose(unit * still(scaled).x, walked.x[7], atol=1e-6)
+
+
+def test_a_slope_that_is_given_has_the_derivative_of_the_default(walking):
+    """Of P = diag(p) + L L', whose product with x needs no matrix."""
+    base, rng = walking[3], np.random.default_rng(0)
+    n = len(base.q)
+    start = np.abs(rng.normal(size=n)) + 1.0, 3.0 * rng.normal(size=(n, 2)), base.q
+    along = tuple(rng.normal(size=x.shape) for x in start)
+
+    def written(p, L, q):
+        return QP(jnp.diag(p) + L @ L.T, q, *base[2:])
+
+    def given(p, L, q):
+        return solve_qp(written(p, L, q), slope=lambda x: p * x + L @ (L.T @ x) + q)
+
+    found = [
+        jax.jit(partial(jax.jvp, function))(start, along)
+        for function in (given, lambda *at: solve_qp(written(*at)))
+    ]
+    for one, other in zip(jax.tree.leaves(found[0][0]), jax.tree.leaves(found[1][0]), strict=True):
+        np.testing.assert_array_equal(one, other)
+    for part in ("x", "y"):
+        one, other = (getattr(tangent, part) for _, tangent in found)
+        assert np.abs(other).max() > 1e-3
+        np.testing.assert_allclose(one, other, atol=1e-9 * np.abs(other).max())

@@ -18,7 +18,7 @@ from test_walks import HandsOver
 from hector_jax.cli import evaluate, propose
 from hector_jax.cli.flags import Propose, Report, Walk
 from hector_jax.control.trajectories import load_command
-from hector_jax.control.weights import nominal
+from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, no_samples
@@ -386,3 +386,35 @@ def test_the_log_of_a_walk_with_the_proposed_file_is_taken(folder, robot, capsys
     refused(folder, f"other weights than the proposed ones, {second}", walk(first))
     report(folder, f"ahead={walk(second, world='standin', seed=3)}")
     assert result(capsys)["walk"] == 1
+
+
+def test_a_log_of_other_weights_is_refused(folder, robot):
+    next_walk(folder, ("ahead",))
+    log = carded(folder, robot, "ahead", weights=expert(robot))
+    words = r"^ahead.npz: a walk with other weights than the proposed ones, robot/weights/0.json$"
+    refused(folder, words, log)
+    own = load_weights(walks.weights_path(folder, 0), robot)
+    higher = own._replace(others={"foot_height": own.others["foot_height"] + 0.01})
+    refused(folder, words, carded(folder, robot, "ahead", weights=higher))
+
+
+def test_a_log_of_the_set_before_is_refused(folder, robot):
+    next_walk(folder, ("ahead",))
+    log = carded(folder, robot, "ahead")
+    report(folder, log)
+    next_walk(folder, ("ahead",))
+    refused(folder, "other weights than the proposed ones, robot/weights/1.json", log)
+
+
+def test_a_log_of_another_command_of_the_same_name_is_refused(folder, robot):
+    next_walk(folder, ("ahead",))
+    log = carded(folder, robot, "ahead", card={"command": "0123456789abcdef"})
+    refused(folder, "a walk of ahead with another command, expected ahead;", log)
+
+
+def test_a_card_that_was_edited_is_refused(folder, robot):
+    next_walk(folder, ("ahead",))
+    log = carded(folder, robot, "ahead", weights=expert(robot))
+    with np.load(log) as archive:
+        np.savez("edited.npz", **archive)
+    refused(folder, "^edited.npz: cut or changed since it was written", "edited.npz")

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,15 +20,17 @@ from killed import toy
 from hector_jax.cli import flags, run_folder
 from hector_jax.cli import tune as command
 from hector_jax.cli.parse import from_line
+from hector_jax.control.trajectories import command_of
 from hector_jax.control.weights import nominal
 from hector_jax.core import files as core_files
 from hector_jax.core.console import exit_code
-from hector_jax.core.files import WriteError, locked
+from hector_jax.core.files import WriteError, locked, write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
 from hector_jax.core.tree_file import load_tree, save_tree
 from hector_jax.robot.model import load_robot
 from hector_jax.store.cache import load_or_make
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig, descend
 
 ROBOT, CONFIG, HERE = load_robot(), TuneConfig(iterations=14), Path(__file__).parent
@@ -412,3 +415,35 @@ def test_killed_25_times_on_all_cores_it_ends_in_the_bytes_of_an_unbroken_run_on
     if job == "collection":
         more = len(looks(tmp_path / "cut" / job)) - len(looks(tmp_path / "whole" / job))
         assert more <= hits  # each kill costs one walk, at most
+
+
+@pytest.fixture
+def begun(tmp_path, monkeypatch):
+    """A run that was cut at once."""
+    monkeypatch.setattr(command, "_tune_in", lambda folder, args: told.append(args))
+    told = []
+    command.tune(flags.Tune(traj=("c",), seeds=3, out=tmp_path / "run"))
+    return tmp_path / "run", told
+
+
+def test_a_run_is_not_resumed_from_another_start(tmp_path):
+    def run(**others):
+        return command._Run(
+            setup=Setup(Executor(), TuneConfig(), load_robot()),
+            folder=tmp_path,
+            args=flags.Tune(traj=("straight",)),
+            start=nominal()._replace(others={name: np.array(x) for name, x in others.items()}),
+            trajectories=(command_of("straight"),),
+            net=SimpleNamespace(params=None),
+        )
+
+    for begun, here in ((run(), run(turn_lead=0.8)), (run(turn_lead=0.8), run())):
+        write_json(tmp_path / "config.json", {})
+        noted = command._note_settings(begun)
+        assert command._note_settings(begun) == noted
+        with pytest.raises(InputError, match="start of other numbers beside Q and R"):
+            command._note_settings(here)
+    write_json(tmp_path / "config.json", {})
+    command._note_settings(run(turn_lead=0.8))
+    with pytest.raises(InputError, match=r"begun with start.others.turn_lead 0.8, here is 0.9"):
+        command._note_settings(run(turn_lead=0.9))

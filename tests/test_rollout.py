@@ -17,10 +17,11 @@ from hector_jax.grfm.dataset import make_dataset
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.curvature import gauss_newton_jit
-from hector_jax.tuning.difftune import TuneConfig, init, tune, tune_step
-from hector_jax.tuning.evaluate import gradient_norms
+from hector_jax.tuning.difftune import TuneConfig, init, step_status, tune, tune_step
+from hector_jax.tuning.evaluate import evaluate_jit, gradient_norms
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
+from hector_jax.tuning.status import StepStatus
 
 LONG = RolloutConfig(ticks=400)
 STRAIGHT = named_command("straight")
@@ -308,3 +309,19 @@ def test_the_derivatives_by_other_numbers_are_those_of_differences_and_of_the_re
     result = tune(config, straight, nominal())
     assert result.loss < found.loss
     assert set(result.weights.others) == set(OTHERS)
+
+
+def test_new_weights_commands_and_effects_need_no_compilation(robot, anchor):
+    tune_step(CONFIG, Scenario(robot, named_command("s"), anchor, PLAIN), start())
+    before = evaluate_jit._cache_size()
+    other = TuneConfig(rollout=SHORT, loss=with_alphas({"L_Eul": 1.0}), beta_q=0.1, iterations=20)
+    weights = expert()._replace(others=start().others)
+    tune_step(other, Scenario(robot, named_command("c"), anchor, PLAIN), weights)
+    assert evaluate_jit._cache_size() == before
+
+
+def test_the_loss_is_that_of_its_parts(straight):
+    found = tune_step(CONFIG, straight, start())
+    expected = 1e5 * found.terms["L_Eul"] + 2e5 * found.terms["L_pos"] + found.terms["L_ctrl"]
+    assert found.loss == pytest.approx(float(expected))
+    assert step_status(CONFIG, found) == StepStatus.ACCEPTED

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from model import BEST_OTHERS, CONFIG, ROBOT
 from pretend import instead, pretend_tuning
+from synthetic import synthetic_walk
 
 from hector_jax.cli import run_folder
 from hector_jax.cli import tune as command
@@ -19,7 +20,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.store import tunings
 from hector_jax.store.setup import Setup
 from hector_jax.store.tunings import Tuned
-from hector_jax.tuning.loss import alphas
+from hector_jax.tuning.loss import alphas, between_loss
 from hector_jax.verdict import choice
 
 
@@ -56,3 +57,12 @@ def test_best_alone_is_tuned_smoothly_on_drawn_models_with_its_own_numbers(monke
 def test_a_limit_of_the_position_error_is_set_once():
     with pytest.raises(InputError, match="--safe sets the position limit, which --start has"):
         run_folder.trajectories(Tune(safe=0.05, start="best"), ROBOT)
+
+
+def test_changes_between_switches_are_those_of_control_without_switches():
+    walk = synthetic_walk(0, 60)
+    wrench = np.concatenate([walk.command.force, walk.command.moment], axis=-1)
+    changes = np.sum(np.diff(wrench, axis=0) ** 2, axis=(1, 2))
+    stays = np.all(walk.contact[1:] == walk.contact[:-1], axis=-1)
+    assert 0 < stays.sum() < len(stays)
+    assert float(between_loss(walk)) == pytest.approx(changes[stays].sum())

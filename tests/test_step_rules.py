@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from scipy.optimize import least_squares
+from scipy.optimize import brentq, least_squares
 
 from hector_jax.tuning.step_rules import (
     LARGEST,
@@ -263,3 +263,17 @@ def test_a_refusal_halves_the_papers_step_and_goes_back():
     )  # a rise is no refusal
     assert float(state.size) == 0.5
     assert float(state.value) == 5.0
+
+
+@pytest.mark.parametrize("ridge", RIDGES)
+@pytest.mark.parametrize("radius", RADII[:3])
+def test_a_step_is_that_of_the_secular_equation(ridge, radius):
+    for seed in range(8):
+        H = positive(seed, 6) + ridge * np.eye(6)
+        g = np.random.default_rng(seed).normal(size=6)
+        step = begun(ridge, g, H - ridge * np.eye(6), 1.0, radius)[0]
+        damped = lambda damping, H=H, g=g: np.linalg.solve(H + damping * np.eye(6), -g)  # noqa: E731
+        excess = lambda damping: np.linalg.norm(damped(damping)) - radius  # noqa: E731, B023
+        inside = excess(0.0) <= 0.0
+        damping = 0.0 if inside else brentq(excess, 0.0, 2 * np.linalg.norm(g) / radius, xtol=1e-14)
+        np.testing.assert_allclose(step, damped(damping), rtol=1e-6, atol=1e-8 * radius)

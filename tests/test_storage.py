@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 from typing import NamedTuple
 
 import jax
@@ -173,3 +174,16 @@ def test_a_result_holds_for_the_code_that_computes_it(edited, module, before, af
     edited(module, before, after)
     again = (environment.code_hash("sim.walk"), code_hash("tuning.difftune", "grfm.network"))
     assert [a == b for a, b in zip(hashes, again, strict=True)] == [same, same]
+
+
+def test_a_renamed_pickle_is_refused(tmp_path):
+    path = tmp_path / "tree.npz"
+    path.write_bytes(pickle.dumps({"a": 1}) * 20)
+    with pytest.raises(ValueError, match="tree.npz: cut or changed"):
+        load_tree(path, TREE, kind="thing")
+
+
+def test_objects_are_not_written(tmp_path):
+    with pytest.raises(ValueError, match="[Oo]bject"):
+        save_tree(tmp_path / "tree.npz", {"a": np.array([None])}, kind="thing")
+    assert list(tmp_path.iterdir()) == []

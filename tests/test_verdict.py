@@ -17,6 +17,7 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.report import matrix as report
+from hector_jax.report import plots
 from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.engine import MUJOCO_C
@@ -309,3 +310,16 @@ def test_families_share_ranges_but_no_numbers():
             assert one[name] != other[name]
             assert 0.3 < one[name] / other[name] < 10.0
     assert [family_of(world) for world in ("standin", "standin-even")] == list(FAMILIES)
+
+
+def test_an_interval_beyond_the_edge_of_the_picture_ends_at_the_edge(tmp_path, drawn):
+    cells = {(C, "s"): cell(tuned=40e6)}  # ten times nominal
+    plots.save_matrix(tmp_path / "verdict.png", cells, report.title_of)
+    ends = np.concatenate([line.get_xdata() for line in drawn[0].axes[0].lines])
+    assert ends.max() == 60.0
+
+
+def test_engines_do_not_share_scores(monkeypatch, tmp_path, walked):
+    for engine in ("c", "drake"):
+        assert call(monkeypatch, *words_of(tmp_path, "--engine", engine)) == 0
+    assert [name for name, _ in walked.jobs] == ["c"] * 4 + ["drake"] * 4

@@ -71,7 +71,7 @@ def print_result(json: bool, result: Any, print_text: Callable[[], None], **opti
 
 
 def print_errors(errors: Mapping[str, Mapping[str, Any]]) -> None:
-    """Print the errors of nets, as `training.report` returns them."""
+    """Print the errors of nets, as `training.errors_by_phi` returns them."""
     print("mean square errors on held-out walks")
     for name, error in errors.items():
         print(f"{name:9s} force {error['force']:8.2f} N^2   moment {error['moment']:7.4f} (N m)^2")

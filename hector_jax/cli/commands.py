@@ -21,7 +21,7 @@ from hector_jax.core.settings import as_toml
 from hector_jax.export import export
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.importing.propose import RobotProposal, standard_form
-from hector_jax.importing.propose import propose_robot as propose_robot
+from hector_jax.importing.propose import propose_robot
 from hector_jax.importing.remarks import differences, remarks
 from hector_jax.importing.table import changes_of_model, section, table_of
 from hector_jax.report.compare import compare_runs, print_comparison
@@ -168,8 +168,8 @@ def run_robot(args: flags.Robot) -> None:
         if proposal.error is None:
             try:
                 loss_of_robot(robot.description)
-                told_delay = margin.delay_lines(robot, walk_config(robot), nominal(robot))
-                lines += section("delay", told_delay)
+                delay = margin.delay_lines(robot, walk_config(robot), nominal(robot))
+                lines += section("delay", delay)
             except InputError as error:  # a setting that controller or loss refuse
                 wrong.append(str(error))
         lines += section("mended", changes_of_model(robot))

@@ -217,4 +217,4 @@ def _on_stand_in(setup: Setup, count: int) -> Walks:
     title = f"walking on {plural(count, 'stand-in plant')}, for information"
     walks = judging.walk_jobs(setup, jobs, title)
     tick = setup.config.rollout.walk.gait.tick
-    return Walks(stack(jobs), stack([at_interval(run_walk, tick) for run_walk in walks]))
+    return Walks(stack(jobs), stack([at_interval(walk, tick) for walk in walks]))

@@ -155,7 +155,7 @@ def drift(
 def as_result(
     errors: Mapping[str, Mapping[str, Any]], phases: Mapping[str, Any], drifts: Mapping[str, Drift]
 ) -> dict[str, Any]:
-    """Return all errors of one world as JSON values; `errors` is from `training.report`."""
+    """Return all errors of one world as JSON values; `errors` is from `training.errors_by_phi`."""
 
     def at(horizon: float, drift: Drift) -> dict[str, float]:
         parts = {"position": drift.position, "euler": drift.euler}
@@ -228,7 +228,7 @@ def error_rows(errors: Iterable[Mapping[str, Any]]) -> list[tuple[str, list[floa
     What is zero for every phi, such as the moments of point feet, is left out.
 
     Args:
-        errors: results of `training.report`, one per phi.
+        errors: results of `training.errors_by_phi`, one per phi.
     """
     errors = list(errors)
     rows = [(f"{kind}, all [{unit}]", [x[kind] for x in errors]) for kind, unit in _UNITS.items()]

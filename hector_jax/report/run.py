@@ -26,7 +26,7 @@ def write_run_report(folder: Path, **contents: Any) -> Path:
             tunings: by set, `without`, `with` and `best`.
             norms: gradient norms of the terms in log-weights at nominal, by model.
             determined: what the tuning `with` knows about its weights.
-            errors: held-out errors of `raw`, `linear`, `net`, from `training.report`.
+            errors: held-out errors of `raw`, `linear`, `net`, from `training.errors_by_phi`.
             proposals, best_proposal, cases: `Change`s of the tuning on walks; name of the set that
                 is `best`; number of walks per weight set.
             chosen: name of the iteration that is `best`.
