@@ -119,6 +119,14 @@ def test_commands_in_pages_parse(page, line, capsys):
     assert code == 0, capsys.readouterr().err
 
 
+def test_the_tests_behind_the_promises_are_there():
+    page, there = (DOCS / "reliability.md").read_text(), {}
+    for name, test, more in re.findall(r"(test_\w+)\.py(?:::(test_\w+)(\.\.\.)?)?", page):
+        text = there.setdefault(name, (ROOT / "tests" / f"{name}.py").read_text())
+        assert f"def {test}" + ("" if more or not test else "(") in text, (name, test)
+    assert len(there) > 15
+
+
 def test_settings_in_pages_are_read(tmp_path):
     (told,) = blocks((DOCS / "howto" / "outputs.md").read_text(), "toml")
     (tmp_path / "night.toml").write_text(told)

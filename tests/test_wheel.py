@@ -40,8 +40,11 @@ def test_the_wheel_walks_in_an_environment_of_its_own(tmp_path):
     call(sys.executable, "-m", "venv", "--without-pip", tmp_path / "venv")
     python = tmp_path / "venv" / "bin" / "python"
     packages = call(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))").strip()
-    # A path in a .pth file is searched, but its own .pth files, the editable install, are not read.
-    (Path(packages) / "running.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    # A path in a .pth file is searched, but its own .pth files, the editable install, are not read;
+    # packages that came with paths of their own, as Pinocchio's, need these.
+    running = sysconfig.get_path("purelib")
+    paths = [running, *(path for path in sys.path if path.startswith(f"{running}/"))]
+    (Path(packages) / "running.pth").write_text("\n".join(paths) + "\n")
     call(
         *pip, "--python", python, "install", "--no-deps", "--no-index", "--ignore-installed", wheel
     )

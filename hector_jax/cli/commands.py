@@ -20,8 +20,7 @@ from hector_jax.core.runtime import workers
 from hector_jax.core.settings import as_toml
 from hector_jax.export import export
 from hector_jax.grfm.training import TrainConfig
-from hector_jax.importing.propose import RobotProposal, standard_form
-from hector_jax.importing.propose import propose_robot
+from hector_jax.importing.propose import RobotProposal, propose_robot, standard_form
 from hector_jax.importing.remarks import differences, remarks
 from hector_jax.importing.table import changes_of_model, section, table_of
 from hector_jax.report.compare import compare_runs, print_comparison

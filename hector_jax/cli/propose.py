@@ -127,9 +127,9 @@ def _check_logs(
     result, before = {}, [p for n in range(number) for p in walks.log_paths(campaign, n)]
     for name, file in files.items():
         log = walk_log.read_log(file, robot, campaign.seconds)
-        inputs = campaign.config, robot
         tracked = {
-            n: walk_log.tracking_errors(*inputs, x, log) for n, x in campaign.commands.items()
+            n: walk_log.tracking_errors(campaign.config, robot, x, log)
+            for n, x in campaign.commands.items()
         }
         result[name] = tracked[name]
         say(f"{file}: {name}; {_tracking_text(result[name])}")
