@@ -168,7 +168,7 @@ def draw_film(path: Path) -> None:
 def draw_before_after(path: Path) -> None:
     """Draw the distance from the reference and the error in pitch along one walk of each set."""
     sets = {"nominal": nominal(), "expert": expert(), "best": best()}
-    with drawing(path, 7.2, 2.6, dpi=190) as figure:
+    with drawing(path, 7.2, 2.6, dpi=190.0) as figure:
         left, right = figure.subplots(1, 2)
         for name, look in looks_of(sets).items():
             one = walk_of(sets[name])
@@ -190,7 +190,7 @@ def draw_before_after(path: Path) -> None:
 def draw_race(path: Path) -> None:
     """Draw the loss of the best weights so far by the number of walks on the simulator."""
     race = json.loads(RACE.read_text())["s"]
-    with drawing(path, 5.8, 3.1, dpi=190, legend_columns=2) as figure:
+    with drawing(path, 5.8, 3.1, dpi=190.0, legend_columns=2) as figure:
         axes = figure.subplots()
         for method, (label, line) in METHODS.items():
             each = {int(walks): np.divide(x, 1e6) for walks, x in race[method]["own"].items()}
@@ -250,7 +250,7 @@ def draw_page(path: Path, run: Path) -> None:
         assert server.stderr is not None
         line = next(line for line in server.stderr if line.startswith("open http"))
         address = line.split()[1]
-        with tempfile.TemporaryDirectory() as profile, opened(address, profile) as tab:
+        with tempfile.TemporaryDirectory() as profile, opened(address, profile, height=960) as tab:
             deadline = time.monotonic() + 240.0
             while "before:" not in tab.text() and time.monotonic() < deadline:
                 time.sleep(2.0)

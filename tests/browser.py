@@ -16,7 +16,7 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 _FLAGS = (
     "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-sync "
     "--disable-background-networking --disable-component-update --use-angle=swiftshader "
-    "--enable-unsafe-swiftshader --remote-debugging-port=0 --window-size=1200,800"
+    "--enable-unsafe-swiftshader --remote-debugging-port=0"
 ).split()
 
 
@@ -48,11 +48,12 @@ class Tab:
 
 
 @contextmanager
-def opened(address, profile):
-    """A page in a browser of its own, with a profile in an empty folder."""
+def opened(address, profile, height=800):
+    """A page in a browser of its own, 1200 pixels wide, with a profile in an empty folder."""
     from websockets.sync.client import connect  # comes with viser
 
-    command = [CHROMIUM, *_FLAGS, f"--user-data-dir={profile}", address]
+    size = f"--window-size=1200,{height}"
+    command = [CHROMIUM, *_FLAGS, size, f"--user-data-dir={profile}", address]
     browser = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
         told = next(line for line in browser.stderr if "DevTools listening on" in line)

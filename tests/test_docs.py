@@ -266,6 +266,18 @@ def few_walks():
     yield f"then has {rival:.2f}e6."
 
 
+PUBLISHED = {
+    "spot": "Spot",
+    "go2": "Unitree Go2",
+    "go1": "Unitree Go1",
+    "t1": "Booster T1",
+    "b2": "Unitree B2",
+    "anymal_b": "ANYmal B",
+    "anymal_c": "ANYmal C",
+    "g1": "Unitree G1",
+}
+
+
 def robots():
     """What the page of results says of other robots."""
     results = report("robots/robots.json")
@@ -281,8 +293,28 @@ def robots():
     for robot in ("quadruped", "go2", "humanoid", "h1"):
         cells = [cell(results["all"][robot][traj], "standin-even") for traj in COMMANDS]
         yield row(names.get(robot, f"`examples/{robot}`"), *cells)
-    plants = results["all"]["h1"]["s"]["sets"]["best"]["standin-even"]["seeds"]
-    yield f"on {len(plants)} plants of `standin-even`"
+    tuned = results["all"]["humanoid"]["straight"]["sets"]["best"]["standin-even"]
+    plants = len(tuned["seeds"])
+    yield f"on {plants} plants of `standin-even`"
+    worse = round(plants * (1 - tuned["change"]["nominal"]["wins"]))
+    yield f"with `nominal` on {worse} plant of {plants}"
+    more = results["more_on_s"]
+    falls = [
+        more[robot]["sets"][name]["standin-even"]["falls"]
+        for robot, name in itertools.product(("quadruped", "go2"), ("nominal", "best"))
+    ]
+    yield f"On {len(more['go2']['sets']['best']['standin-even']['seeds'])} more plants"
+    told = (
+        "the quadruped falls {} time with `nominal` and {} times with `best`, Go2 {} and {} times"
+    )
+    yield told.format(*falls)
+    for robot, name in PUBLISHED.items():
+        runs = results["straight"][robot]
+        tuned = runs["straight"]["sets"]["best"]["standin"]
+        falls = [runs[traj]["sets"]["nominal"]["standin"]["falls"] for traj in ("c", "s")]
+        yield row(name, interval(tuned["change"]["nominal"], "+"), "{}, {}".format(*falls))
+        assert tuned["falls"] == 0
+    yield f"on {len(tuned['seeds'])} plants of the stand-in, without a fall"
 
 
 def engines():

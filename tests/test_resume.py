@@ -208,16 +208,17 @@ def is_gone(process):
 
 @pytest.mark.skipif(not Path("/proc").exists(), reason="asks /proc for the workers")
 @pytest.mark.parametrize(
-    ("signals", "code", "line"),
+    ("signals", "codes", "line"),
     [
-        ([signal.SIGINT, signal.SIGINT], 130, "toy: interrupted"),
-        ([signal.SIGTERM], 143, "toy: terminated"),
-        ([signal.SIGKILL], -9, ""),
-        ([signal.SIGALRM, signal.SIGINT], 130, "toy: interrupted"),
+        # the second one can come when Python has put its own handlers away: -2 is 130 to a shell
+        ([signal.SIGINT, signal.SIGINT], [130, -2], "toy: interrupted"),
+        ([signal.SIGTERM], [143], "toy: terminated"),
+        ([signal.SIGKILL], [-9], ""),
+        ([signal.SIGALRM, signal.SIGINT], [130], "toy: interrupted"),
     ],
     ids=["twice", "SIGTERM", "SIGKILL", "another"],
 )
-def test_a_signal_ends_a_program_and_its_workers_in_one_line(tmp_path, signals, code, line):
+def test_a_signal_ends_a_program_and_its_workers_in_one_line(tmp_path, signals, codes, line):
     (tmp_path / "program.py").write_text(PROGRAM)
     program = subprocess.Popen(
         [sys.executable, "program.py"],
@@ -235,7 +236,7 @@ def test_a_signal_ends_a_program_and_its_workers_in_one_line(tmp_path, signals, 
         # an interrupt of the terminal reaches the workers too
         (os.killpg if number == signal.SIGINT else os.kill)(program.pid, number)
     _, err = program.communicate(timeout=60)
-    assert program.returncode == code
+    assert program.returncode in codes
     assert "Traceback" not in err
     assert err.startswith(line)
     for _ in range(100):

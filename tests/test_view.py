@@ -192,9 +192,10 @@ def _until(seconds, look):
 def _drawn(picture):
     """The scene where both robots are in it: their colours, on what is not one plain plane."""
     scene = picture[:, :800].astype(int)
-    red = (scene[..., 0] > 130) & (scene[..., 1] < 80) & (scene[..., 2] < 100)
-    green = (scene[..., 0] < 70) & (scene[..., 1] > 90) & (scene[..., 2] < 130)
-    seen = red.sum() > 50 and green.sum() > 50 and scene.std() > 15.0
+    red, green, blue = scene[..., 0], scene[..., 1], scene[..., 2]
+    before = (blue > green + 40) & (green > red + 20)
+    after = (green > red + 30) & (green > blue)
+    seen = before.sum() > 50 and after.sum() > 50 and scene.std() > 15.0
     return scene if seen else None
 
 
@@ -213,6 +214,9 @@ def test_a_browser_shows_the_run_until_it_is_interrupted(tmp_path):
         "0.5",
         "--port",
         "0",
+        "--sets",  # blue and green
+        "expert",
+        "with",
     ]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as page:
         try:
@@ -220,7 +224,7 @@ def test_a_browser_shows_the_run_until_it_is_interrupted(tmp_path):
             with opened(told.split()[1], tmp_path / "profile") as tab:
                 _until(300, lambda: _drawn(tab.picture()))
                 words = tab.text()
-                for expected in ("before: nominal", "after: with", "Pause", "L on the model"):
+                for expected in ("before: expert", "after: with", "Pause", "L on the model"):
                     assert expected in words
                 write_metrics(run, 20)  # the run goes on
                 _until(60, lambda: True if "with: iteration 20" in tab.text() else None)

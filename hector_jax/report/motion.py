@@ -48,7 +48,8 @@ class Motion(NamedTuple):
 
     def sample_at(self, times: Float[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
         """Return the indices of the samples at some times [s]."""
-        return np.clip(np.round(times / self.period).astype(int) - 1, 0, len(self.qpos) - 1)
+        index = np.round(times / self.period).astype(int) - 1
+        return np.asarray(np.clip(index, 0, len(self.qpos) - 1))
 
 
 def motion(robot: Robot, walk: Trajectory, ground: Mapping[str, Wrench] | None = None) -> Motion:
