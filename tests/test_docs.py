@@ -227,6 +227,15 @@ def tracking():
         changes = [sets(t)[name]["change"][base] for t in COMMANDS]
         assert all(change["counts"] for change in changes)
         yield row(f"`{name}`", f"`{base}`", *map(interval, changes))
+    integral = report("integral.json")["sets"]
+    yield f"On {len(integral['s']['best']['seeds'])} more plants L changes"
+    rows = {
+        "nominal with integral": ("`nominal`", "that of `best`"),
+        "with": ("`with`", "none"),
+        "best": ("`best`", "its own"),
+    }
+    for name, head in rows.items():
+        yield row(*head, *(interval(integral[t][name]["change"]["nominal"]) for t in COMMANDS))
     for name in ("nominal", "without", "with", "best"):
         cells = smoothness(name)
         yield row(f"`{name}`", *(f"{x:.1f} times, {y:{'+' * bool(y)}} %" for x, y in cells))

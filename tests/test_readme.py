@@ -93,9 +93,9 @@ def test_the_share_of_the_integral_action_is_that_of_its_file():
     def told(name):
         each = [report["sets"][trajectory][name]["change"]["nominal"] for trajectory in COMMANDS]
         assert all(change["counts"] for change in each)
-        return "{:.0f}, {:.0f} and {:.0f} %".format(*(-change["median"] for change in each))
+        return "{:.0f}, {:.0f} and {:.0f}".format(*(-change["median"] for change in each))
 
-    text = "Of the loss it takes {} with plain weights, tuning without it {}, both {}."
+    text = "Of the loss it takes {} % with plain weights, tuning without it {}, both {} %."
     names = ("nominal with integral", "with", "best")
     assert text.format(*map(told, names)) in TEXT
 
