@@ -40,7 +40,7 @@ from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.grfm.network import as_effect, effect_of
 from hector_jax.grfm.training import TrainConfig
-from hector_jax.qp import QpConfig, solve_qp
+from hector_jax.qp import INTERIOR_POINT, JAXOPT, QpConfig, solve_qp
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.parallel import walk_batch
@@ -79,7 +79,7 @@ def controllers() -> dict[str, WalkConfig]:
         "paper's footholds": replace(default, footstep=PAPER_FOOTHOLDS),
         "double support": replace(default, gait=DOUBLE_SUPPORT),
         "leg weight": replace(default, legs=LegConfig(gravity_compensation=True)),
-        "jaxopt": replace(default, mpc=MpcConfig(qp=QpConfig(solver="jaxopt"))),
+        "jaxopt": replace(default, mpc=MpcConfig(qp=QpConfig(JAXOPT))),
     }
 
 
@@ -89,7 +89,7 @@ def qp() -> Arrays:
     write = jax.vmap(partial(problems.layer_qp, WalkConfig(), robot))
     qps = jax.jit(write)(problems.draw_problems(WalkConfig(), robot, 24))
     found = {}
-    for solver in ("interior_point", "jaxopt"):
+    for solver in (INTERIOR_POINT, JAXOPT):
         config = QpConfig(solver=solver)
         solution = jax.jit(jax.vmap(partial(solve_qp, config=config)))(qps)
         found[f"{solver} x"] = solution.x

@@ -2,7 +2,7 @@
 
 import json
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -117,7 +117,7 @@ def test_a_run_is_exported_and_viewed_with_the_robot_that_it_was_for(strider, tm
     config = {
         "flags": as_table(Tune(robot=STRIDER)),
         "robot": robot_hash(strider),
-        "tune": asdict(replace(settings, rollout=walk)) | {"loss": {}},
+        "tune": replace(settings, rollout=walk).as_table(),
     }
     write_json(tmp_path / "config.json", config)
     save_weights(tmp_path / "weights" / "with.json", expert(strider))

@@ -7,7 +7,7 @@ import json
 import re
 import shutil
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -30,6 +30,7 @@ from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
 from hector_jax.control.reference import Command, named_command
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights
+from hector_jax.core.settings import to_table
 from hector_jax.core.trajectory import State, pack_wrench
 from hector_jax.export import export
 from hector_jax.export.controller import Check, _measured, compare_with_live, record
@@ -272,7 +273,7 @@ def save_run(folder):
     config = {
         "flags": as_table(Tune()),
         "robot": robot_hash(load_robot()),
-        "tune": {"rollout": {"walk": asdict(CONFIG)}},
+        "tune": {"rollout": {"walk": to_table(CONFIG)}},
     }
     (folder / "config.json").write_text(json.dumps(config))
     return folder
@@ -479,7 +480,7 @@ def test_what_differs_from_the_live_controller_is_not_written(
 
 def test_a_run_is_exported_with_its_own_controller(run):
     own = replace(CONFIG, gait=GaitConfig(stance=24, swing=16), mpc=MpcConfig(friction=0.4))
-    kept = asdict(own)
+    kept = to_table(own)
     del kept["mpc"]["effort_reference"]  # of a run from before there was such a setting
     (run / "config.json").write_text(json.dumps({"tune": {"rollout": {"walk": kept}}}))
     assert find_weights(run, "best") == (run / "weights" / "best.json", own)

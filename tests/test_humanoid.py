@@ -125,7 +125,7 @@ def test_the_bounds_of_a_flat_foot_are_its_edges():
 
 
 def test_the_controller_of_flat_feet_has_six_inputs_a_foot():
-    assert CONFIG.mpc.contact_model == FLAT_FOOT
+    assert CONFIG.mpc.contact == FLAT_FOOT
     assert (FLAT_FOOT.inputs, len(CONFIG.legs.kp)) == (6, 6)
 
 

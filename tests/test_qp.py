@@ -20,6 +20,7 @@ from oracles import (
 
 from benchmarks.problems import draw_problems, layer_qp
 from hector_jax.control.controller import WalkConfig
+from hector_jax.core.settings import from_table, to_table
 from hector_jax.qp import QP, QpConfig, Solver, Status, check_solved, gpu_kernel, solve_qp
 from hector_jax.qp.active_set import first_guess
 from hector_jax.qp.interior_point import approach, interior_point
@@ -563,8 +564,9 @@ def test_a_batch_is_a_loop_whatever_becomes_of_its_problems(walking):
 
 
 def test_a_solver_is_a_value_and_one_of_ones_own_is_another(walking, walked):
-    assert QpConfig(solver="jaxopt") == QpConfig(solver=JAXOPT)
-    assert hash(QpConfig(solver="jaxopt")) == hash(QpConfig(solver=JAXOPT))
+    read = from_table("file", QpConfig, {"solver": "jaxopt"})
+    assert (read, hash(read)) == (QpConfig(JAXOPT), hash(QpConfig(JAXOPT)))
+    assert to_table(read)["solver"] == "jaxopt"
     called = []
 
     def counted(*args, max_iterations):
@@ -582,7 +584,7 @@ def test_jaxopt_is_a_second_solver_behind_the_door(walking):
     for qp in walking[:4]:
         tangent = jax.tree.map(np.zeros_like, qp)._replace(q=np.ones(50))
         ours, mine = along(qp, tangent)
-        theirs, other = along(qp, tangent, QpConfig(solver="jaxopt"))
+        theirs, other = along(qp, tangent, QpConfig(JAXOPT))
         check_solved(theirs)
         np.testing.assert_allclose(theirs.x, ours.x, atol=1e-6)
         np.testing.assert_allclose(other, mine, atol=1e-6 * np.abs(mine).max())

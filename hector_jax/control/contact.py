@@ -229,11 +229,9 @@ CORNER_FRICTION = InputConstraint("corner_friction", of=_corner_friction)
 _POINT = (FRICTION, UNILATERAL_FORCE)
 _LINE = (*_POINT, LINE_PRESSURE, LINE_FRICTION)
 _FLAT = (*_POINT, LINE_PRESSURE, SIDE_PRESSURE, TORSION)
-CONSTRAINTS = (*_LINE, SIDE_PRESSURE, TORSION, CORNER_FRICTION)
-"""Constraints that a file can name."""
+Constraint.known = (*_LINE, SIDE_PRESSURE, TORSION, CORNER_FRICTION)
 
 POINT_FOOT = ContactModel("point", components=(0, 1, 2), constraints=_POINT)
 LINE_FOOT = ContactModel("line", components=(0, 1, 2, 4, 5), constraints=_LINE)
 FLAT_FOOT = ContactModel("flat", components=(0, 1, 2, 3, 4, 5), constraints=_FLAT)
-CONTACT_MODELS = (POINT_FOOT, LINE_FOOT, FLAT_FOOT)
-"""Contact models that a file can name."""
+ContactModel.known = (POINT_FOOT, LINE_FOOT, FLAT_FOOT)

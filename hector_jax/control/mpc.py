@@ -17,7 +17,7 @@ see also `contact`.
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, NamedTuple, cast
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,8 +25,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hector_jax.control.contact import (
-    CONSTRAINTS,
-    CONTACT_MODELS,
     LINE_FOOT,
     LINE_FRICTION,
     Constraint,
@@ -41,7 +39,6 @@ from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array, contract
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.inputs import InputError, short_repr
-from hector_jax.core.part import choose_part
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SHARE, Range, check
 from hector_jax.core.trajectory import State, Wrench, pack_wrench, unpack_wrench
 from hector_jax.qp import QP, QpConfig, Solution, block_diagonal, solve_qp
@@ -81,8 +78,8 @@ class MpcConfig:
     tilt_gain: Annotated[float, NOT_NEGATIVE] = 0.0
     yaw_gain: Annotated[float, NOT_NEGATIVE] = 0.0
     qp: QpConfig = QpConfig()
-    contact: str = LINE_FOOT  # a ContactModel or its name
-    constraints: tuple[str, ...] | None = None  # Constraints or names; None: the contact model's
+    contact: ContactModel = LINE_FOOT
+    constraints: tuple[Constraint, ...] = ()  # none: those of the contact model
 
     def __post_init__(self) -> None:
         share, words = Range(0.0, 1.0, above=True), ("zero", "gravity")
@@ -90,16 +87,10 @@ class MpcConfig:
         if len(self.inertia_share) != 3:
             got = short_repr(self.inertia_share)
             raise InputError(f"MpcConfig.inertia_share must be 3 numbers, got {got}")
-        model = choose_part("MpcConfig.contact", self.contact, ContactModel, CONTACT_MODELS)
-        chosen = [
-            choose_part("MpcConfig.constraints", constraint, Constraint, CONSTRAINTS)
-            for constraint in (model.constraints if self.constraints is None else self.constraints)
-        ]
-        object.__setattr__(self, "contact", model)
-        object.__setattr__(self, "constraints", tuple(chosen))
+        object.__setattr__(self, "constraints", self.constraints or self.contact.constraints)
         if not self.on("inputs"):
             text = "MpcConfig.constraints must have one on the inputs, or feet can pull"
-            raise InputError(f"{text}, got {tuple(chosen)}")
+            raise InputError(f"{text}, got {self.constraints}")
 
     def parameters(self, weights: Weights) -> MpcParameters:
         """Return the traced numbers."""
@@ -122,16 +113,10 @@ class MpcConfig:
         root = np.sqrt(self.inertia_share)
         return inertia * np.outer(root, root).astype(inertia.dtype)
 
-    @property
-    def contact_model(self) -> ContactModel:
-        """Contact model of a stance foot."""
-        return cast(ContactModel, self.contact)
-
     def on(self, what: str) -> tuple[Constraint, ...]:
         """Return the constraints on "inputs" or on "states"."""
-        constraints = cast(tuple[Constraint, ...], self.constraints)
         excluded = () if self.line_friction else (LINE_FRICTION,)
-        return tuple(c for c in constraints if c.on == what and c not in excluded)
+        return tuple(c for c in self.constraints if c.on == what and c not in excluded)
 
 
 class Horizon(NamedTuple):
@@ -223,7 +208,7 @@ def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: in
     robot = robot._replace(inertia=config.planned_inertia(robot.inertia))
     A, B = jax.vmap(lambda e, r: srbm.linearise(robot, e, r, dt))(horizon.euler, horizon.lever)
     feet = jax.vmap(lambda c: feet_of_contacts(c.astype(dtype), max_contacts))(horizon.contact)
-    G = jax.vmap(partial(_input_map, config.contact_model))(feet, horizon.foot_yaw)
+    G = jax.vmap(partial(_input_map, config.contact))(feet, horizon.foot_yaw)
     # inputs change rates and velocities, which persist; angles and positions integrate them
     changes = B[:, 6:9], B[:, 9:12]
     turn, push = (contract("kxu,kub->kxb", change, G) for change in changes)
@@ -283,7 +268,7 @@ def half_slope(
 
 def _no_foot(config: MpcConfig, condensed: Condensed) -> Float[Array, "N b"]:
     """Return 1 for the inputs of contacts without a foot, else 0."""
-    return jnp.repeat(1.0 - condensed.feet.sum(-1), config.contact_model.inputs, axis=-1)
+    return jnp.repeat(1.0 - condensed.feet.sum(-1), config.contact.inputs, axis=-1)
 
 
 def half_hessian(
@@ -308,7 +293,7 @@ def half_hessian(
 def input_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> Rows:
     """Return the rows of constraints on inputs, block-diagonal by step: A is (N, rows, b)."""
     feet, (robot, parameters, _, horizon, _) = condensed.feet, problem
-    selection = jnp.asarray(config.contact_model.selection, feet.dtype)
+    selection = jnp.asarray(config.contact.selection, feet.dtype)
     robot = robot._replace(half_width=config.sole_width * robot.half_width)
 
     def of_contact(yaw: Float[Array, ""]) -> Rows:

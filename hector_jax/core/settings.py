@@ -89,25 +89,31 @@ def convert(value: Any, kind: Any, rule: Rule | None = None, name: str = "") -> 
     except msgspec.ValidationError:
         valid, converted = False, None
     if not valid:
-        words = get_args(kind) if get_origin(kind) is Literal else ()
+        words = get_args(kind) if get_origin(kind) is Literal else _known(kind)
         hint = did_you_mean(value, words) if isinstance(value, str) else ""
         message = f"must be {_expected(kind, rule)}, got {short_repr(value)}{hint}"
         raise InputError(f"{name} {message}" if name else message)
     return converted
 
 
+def _known(kind: Any) -> tuple[str, ...]:
+    """Return the names of a kind of `core.part.Part`, or of that in a list of them."""
+    kinds = [kind, *get_args(kind), *(x for inner in get_args(kind) for x in get_args(inner))]
+    return tuple(str(part) for one in kinds for part in getattr(one, "known", ()))
+
+
 def _builtin(value: Any) -> Any:
-    """Convert a number of NumPy or a `Part` to Python's own type."""
-    if isinstance(value, str):
-        return str(value)
+    """Convert a number of NumPy to Python's own type."""
     if isinstance(value, Real) and not isinstance(value, bool):
         return int(value) if isinstance(value, Integral) else float(value)
     return tuple(map(_builtin, value)) if isinstance(value, list | tuple) else value
 
 
 def _instance(kind: type, value: Any) -> Any:
-    if kind is Path and isinstance(value, str):
+    if isinstance(value, str) and kind is Path:
         return Path(value)
+    if isinstance(value, str) and hasattr(kind, "known"):
+        return kind.named(value)
     if isinstance(kind, type) and not isinstance(value, kind):
         raise msgspec.ValidationError(f"expected {kind}")
     return value
@@ -116,6 +122,8 @@ def _instance(kind: type, value: Any) -> Any:
 def _expected(kind: Any, rule: Rule | None = None) -> str:
     """Describe the values that a type and a rule allow, in words."""
     inner = get_args(kind)
+    if hasattr(kind, "known"):
+        return f"{' or '.join(map(repr, _known(kind)))}, or a {kind.__name__}"
     if get_origin(kind) is Annotated:
         return _expected(inner[0], next((x for x in inner if isinstance(x, Range)), rule))
     if get_origin(kind) is Literal:

@@ -157,7 +157,7 @@ def _samples(
         return jnp.concatenate([x[1:], x[-1:]])
 
     commands = to_yaw_frame(jax.tree.map(newest_first, walk.command))
-    effect, has_moments = current.effect, config.mpc.contact_model.axes == 6
+    effect, has_moments = current.effect, config.mpc.contact.axes == 6
     if not has_moments:  # what a rolling ball adds belongs to the legs' load
         effect = effect._replace(moment=jnp.zeros_like(effect.moment))
     label = to_yaw_frame(effect)

@@ -39,7 +39,7 @@ def as_effect(params: Params) -> jax.tree_util.Partial:
 
 def effect_of(params: Params | None, config: WalkConfig) -> jax.tree_util.Partial:
     """Return the phi of a net, or of the plain rigid body (None), in one and the same program."""
-    axes = config.mpc.contact_model.axes
+    axes = config.mpc.contact.axes
     return as_effect(plain_net(config.gait, axes) if params is None else params)
 
 
@@ -85,7 +85,7 @@ def load_net(
 
 def empty_params(variant: str, hidden: tuple[int, ...], config: WalkConfig) -> Params:
     """Return zeros in the parameters' shapes, as `load_tree` takes them; an axis of 0 is ticks."""
-    sizes = len(config.gait.offsets), config.mpc.contact_model.axes
+    sizes = len(config.gait.offsets), config.mpc.contact.axes
     shapes = _shapes(VARIANTS[variant], hidden, *sizes, jnp.result_type(float))
     return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
 

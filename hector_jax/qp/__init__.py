@@ -7,12 +7,12 @@ loop over the methods and the status, `derivative` the JVP rule and `solver` the
 
 from hector_jax.qp.derivative import SAVED
 from hector_jax.qp.linear import block_diagonal
-from hector_jax.qp.method import INTERIOR_POINT, JAXOPT, SOLVERS, QpConfig, Solver
+from hector_jax.qp.method import INTERIOR_POINT, JAXOPT, QpConfig, Solver
 from hector_jax.qp.problem import QP, Solution, Status
 from hector_jax.qp.solver import check_solved, solve_qp
 
 # fmt: off
 __all__ = [
-    "INTERIOR_POINT", "JAXOPT", "QP", "SAVED", "SOLVERS", "QpConfig", "Solution", "Solver",
+    "INTERIOR_POINT", "JAXOPT", "QP", "SAVED", "QpConfig", "Solution", "Solver",
     "Status", "block_diagonal", "check_solved", "solve_qp",
 ]

@@ -31,7 +31,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from hector_jax.core.arrays import Array
-from hector_jax.core.part import Part, choose_part
+from hector_jax.core.part import Part
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, check
 from hector_jax.core.tree import where
 from hector_jax.qp.active_set import active_set, first_guess, no_guess
@@ -72,8 +72,7 @@ class Solver(Part):
 
 INTERIOR_POINT = Solver("interior_point", approach=approach, guess=first_guess)
 JAXOPT = Solver("jaxopt", approach=box_osqp, guess=None)
-SOLVERS = (INTERIOR_POINT, JAXOPT)
-"""Solvers that a file can name."""
+Solver.known = (INTERIOR_POINT, JAXOPT)
 
 
 @dataclass(frozen=True)
@@ -81,9 +80,8 @@ class QpConfig:
     """Configuration of the QP solver. Numbers that are None depend on the dtype.
 
     Attributes:
-        solver: a `Solver`, or a name in SOLVERS: "interior_point" (active set first, interior point
-            if it does not converge) or "jaxopt" (BoxOSQP instead of both, with our last correction
-            and our derivative).
+        solver: INTERIOR_POINT (active set first, interior point if it does not converge), JAXOPT
+            (BoxOSQP instead of both, with our last correction and our derivative) or another.
         tolerance: largest residual of a SOLVED problem; 1e-8 in 64 bits, 1e-4 in 32.
         active_set_tries: largest number of active set iterations before the solver's approach.
         max_iterations: of the approach; BoxOSQP takes a hundred times as many, cheaper ones.
@@ -91,7 +89,7 @@ class QpConfig:
             in 32.
     """
 
-    solver: str = INTERIOR_POINT
+    solver: Solver = INTERIOR_POINT
     tolerance: float | None = None
     active_set_tries: Annotated[int, AT_LEAST_ONE] = 15
     max_iterations: Annotated[int, AT_LEAST_ONE] = 60
@@ -99,8 +97,6 @@ class QpConfig:
 
     def __post_init__(self) -> None:
         check(self, tolerance=POSITIVE, ratio_cap=POSITIVE)
-        solver = choose_part("QpConfig.solver", self.solver, Solver, SOLVERS)
-        object.__setattr__(self, "solver", solver)
 
     def tolerances(self, dtype: jnp.dtype) -> Tolerances:
         """Return the tolerances of this config for a dtype."""

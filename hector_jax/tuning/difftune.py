@@ -15,7 +15,7 @@ iteration; `batch` compiles them into its loop on the device.
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated, Any, NamedTuple, cast
 
@@ -30,7 +30,7 @@ from hector_jax.control.controller import WalkConfig
 from hector_jax.control.weights import Weights, directions, nominal, weights_to_vector
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError, plural, short_repr, unknown
-from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, check
+from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, check, to_table
 from hector_jax.core.trajectory import Wrench
 from hector_jax.core.tree import stack, where
 from hector_jax.tuning import step_rules
@@ -80,7 +80,7 @@ class TuneConfig:
 
     def as_table(self) -> dict[str, Any]:
         """Return the settings as JSON values; of the loss only its weights."""
-        return asdict(replace(self, loss=PAPER_LOSS)) | {"loss": alphas(self.loss)}
+        return to_table(replace(self, loss=PAPER_LOSS)) | {"loss": alphas(self.loss)}
 
 
 def _why_not_tunable(walk: WalkConfig, name: str) -> str:
