@@ -182,14 +182,14 @@ def test_robots_tuned_for_straight_are_told_as_their_file_has_them():
     robots = json.loads(ROBOTS.read_text())
     runs = robots["straight"].items()
     tuned = {name: one["straight"]["sets"]["best"]["standin"] for name, one in runs}
-    told = "Spot {spot}, Go2 {go2}, Go1 {go1}, Booster T1 {t1}, B2 {b2}, ANYmal B {anymal_b}, "
-    told += "ANYmal C {anymal_c}, Unitree G1 {g1} %; no fall"
+    told = "Spot {spot}, Go2 {go2}, Go1 {go1}, T1 {t1}, B2 {b2}, ANYmal B {anymal_b}, "
+    told += "ANYmal C {anymal_c}, Adam Lite {adam_lite}, G1 {g1} %; no fall"
     changes = {n: f"{one['change']['nominal']['median']:+.0f}" for n, one in tuned.items()}
     assert told.format(**changes) in TEXT
     assert {(len(one["seeds"]), one["falls"]) for one in tuned.values()} == {(8, 0)}
     assert "Tuned for straight, on 8 each:" in TEXT
     on_s = {name: one["s"]["sets"]["nominal"]["standin"]["falls"] for name, one in runs}
-    assert {name for name, falls in on_s.items() if falls} == {"g1", "t1"}
+    assert {name for name, falls in on_s.items() if falls} == {"g1", "t1", "adam_lite"}
     more = [one["sets"] for one in robots["more_on_s"].values()]
     falls = [sum(one[n]["standin-even"]["falls"] for one in more) for n in ("nominal", "best")]
     assert falls == [1, 0]  # "fall once before and never after"
