@@ -12,47 +12,6 @@ from hector_jax.report.plots import style
 from hector_jax.report.plots.style import SETS, category_axis, drawing, label_of, log_axis, looks_of
 
 
-def ratios(
-    path: Path, columns: Sequence[str], sets: Mapping[str, Float[np.ndarray, " columns"]]
-) -> str:
-    """Draw the losses of weight sets as ratios to nominal, by trajectory.
-
-    Args:
-        path: file to write.
-        columns: the trajectories.
-        sets: by name, a ratio per trajectory.
-    """
-    width = 0.7 / max(len(sets), 1)
-    with drawing(path, 7.5, 3.2) as figure:
-        axes, looks = figure.subplots(), looks_of(sets)
-        for i, (name, values) in enumerate(sets.items()):
-            x = np.arange(len(columns)) + width * (i - (len(sets) - 1) / 2)
-            axes.plot(x, values, markersize=6, label=label_of(name), **looks[name].dot)
-        axes.axhline(1.0, color="black", linewidth=0.8)
-        category_axis(axes, columns)
-        log_axis(axes, "y")
-        axes.set_ylabel("L / L of nominal")
-    return "Loss on the hfs as a ratio to that of the nominal weights (1)."
-
-
-def by_plant(path: Path, sets: Mapping[str, Float[np.ndarray, " plants"]]) -> str:
-    """Draw the losses of weight sets on many plants, each set's in rising order.
-
-    Args:
-        path: file to write.
-        sets: by name, a loss per plant.
-    """
-    with drawing(path, 6.0, 3.4) as figure:
-        axes = figure.subplots()
-        for name, look in looks_of(sets).items():
-            share = 100 * (np.arange(len(sets[name])) + 0.5) / len(sets[name])
-            line = {"marker": look.marker, "label": label_of(name), **look.line}
-            axes.plot(share, np.sort(sets[name]) / 1e6, **line)
-        log_axis(axes, "y")
-        axes.set(xlabel="plants [%], by their loss", ylabel="L [10$^6$]", xlim=(0, 100))
-    return "Loss on each plant, in rising order for each set: the right end is the tail."
-
-
 def front(
     path: Path,
     prices: Float[np.ndarray, " points"],

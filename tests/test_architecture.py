@@ -116,7 +116,7 @@ def test_of_the_scripts_only_those_with_verdicts_reach_the_stand_in():
         for path in scripts
         if any(name.startswith("hector_jax.sim.standin") for name in imported(path))
     }
-    experiments = {f"experiments.{name}" for name in ("robustness", "batch", "pictures")}
+    experiments = {f"experiments.{name}" for name in ("robustness", "pictures")}
     assert knowing == experiments | {"benchmarks.golden"}
 
 

@@ -14,22 +14,24 @@ part in its static config is recompiled for another part of the same name. Its `
 identifies stored results, has the content of a user's functions; its `str` is the name.
 """
 
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, TypeVar
 
 from hector_jax.core.identity import function_id
+
+P = TypeVar("P", bound="Part")
 
 
 class Part:
     """A named value of one or two pure functions."""
 
-    known: ClassVar[tuple[Self, ...]]  # pyright: ignore[reportGeneralTypeIssues]
+    known: ClassVar[tuple[Any, ...]]
 
     def __init__(self, name: str, **functions: Any) -> None:
         """Create a part with this name and these functions."""
         self.__dict__.update(functions, name=name)
 
     @classmethod
-    def named(cls, name: str) -> Self:
+    def named(cls: type[P], name: str) -> P:
         """Return the known part of a name.
 
         Raises:
