@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.artist import setp
 
 from hector_jax.report.plots import style
-from hector_jax.report.plots.style import SETS, category_axis, drawing, label_of, log_axis, looks_of
+from hector_jax.report.plots.style import SETS, drawing, label_of, log_axis, looks_of
 
 
 def front(
@@ -138,85 +137,6 @@ _PHI = {  # colour, marker, and hatch of bars
     "net": (style.GREEN, "o", None),
     "net without legs": (style.BLUE, "s", "......"),
 }
-
-
-def gradients(
-    path: Path,
-    names: Sequence[str],
-    simulator: Float[np.ndarray, "phases weights"],
-    models: Mapping[str, Float[np.ndarray, "phases weights"]],
-) -> str:
-    """Draw gradients of the loss in log-weights, scaled to unit length: hfs, and the model by phi.
-
-    Args:
-        path: file to write.
-        names: of the weights.
-        simulator: gradients on the hfs by start phase.
-        models: gradients on the model by phi, then by start phase.
-    """
-    at, width = np.arange(len(names)), 0.8 / len(models)
-    with drawing(path, 10.0, 4.2, legend_columns=3) as figure:
-        axes = figure.subplots()
-
-        def bars(x: np.ndarray, rows: np.ndarray, width: float, name: str, **look: Any) -> None:
-            mean = rows.mean(axis=0)
-            size = np.linalg.norm(mean)
-            axes.bar(x, mean / size, width, label=f"{name}, {size / 1e6:.2g}e6", **look)
-
-        bars(at, simulator, 0.9, "hfs", facecolor="0.95", edgecolor="0.3", linewidth=0.9)
-        size = np.linalg.norm(simulator.mean(axis=0))
-        low, high = simulator.min(axis=0) / size, simulator.max(axis=0) / size
-        axes.vlines(at - 0.45, low, high, color="black", linewidth=2.0, zorder=3)
-        for i, (name, rows) in enumerate(models.items()):
-            x, (color, _, hatch) = at + width * (i - (len(models) - 1) / 2), _PHI[name]
-            look = {"color": color, "hatch": hatch, "edgecolor": "white", "linewidth": 0.0}
-            bars(x, rows, 0.8 * width, name, **look)
-        axes.axhline(0.0, color="black", linewidth=0.8)
-        category_axis(axes, [name.replace("_", " ") for name in names], 3)
-        axes.set_ylabel("dL / d log weight, unit length")
-    return (
-        "Gradients of L in log-weights, mean over start phases, each scaled to unit length; the "
-        "lengths are in the legend. The line at the left of each wide bar spans the start phases "
-        f"on the hfs; the narrow ones are, from the left, {', '.join(models)}."
-    )
-
-
-def ranks(
-    path: Path,
-    simulator: Mapping[tuple[str, str], Float[np.ndarray, " sets"]],
-    models: Mapping[tuple[str, str], Mapping[str, Float[np.ndarray, " sets"]]],
-    correlations: Mapping[tuple[str, str], Mapping[str, float]],
-) -> str:
-    """Draw the loss of disturbed weight sets on the model against that on the hfs.
-
-    Args:
-        path: file to write.
-        simulator: losses on the hfs by trajectory and factor, the rows and columns of panels.
-        models: losses on the model by trajectory and factor, then by phi.
-        correlations: rank correlations by trajectory and factor, then by phi.
-    """
-    trajectories, factors = (list(dict.fromkeys(k[i] for k in simulator)) for i in (0, 1))
-    size = (3.3 * len(trajectories) + 0.2, 3.0 * len(factors) + 0.4)
-    hollow = {"linestyle": "none", "markerfacecolor": "none", "markersize": 3.5, "mew": 0.8}
-    with drawing(path, *size, legend_columns=0) as figure:
-        panels = figure.subplots(len(factors), len(trajectories), squeeze=False)
-        for (trajectory, factor), truth in simulator.items():
-            panel = panels[factors.index(factor), trajectories.index(trajectory)]
-            for name, losses in models[trajectory, factor].items():
-                color, marker, _ = _PHI[name]
-                label = f"{name}: {correlations[trajectory, factor][name]:.2f}"
-                look = {"color": color, "marker": marker, "label": label, **hollow}
-                panel.plot(truth / 1e6, losses / 1e6, **look)
-            panel.legend(loc="upper left", handlelength=1.0, borderaxespad=0.2)
-            panel.set_title(f"{trajectory}, within x/{factor}")
-            log_axis(panel, "x")
-            panel.set_yscale("log")
-            low, high = panel.get_ylim()
-            panel.set_ylim(low, high * (high / low) ** 0.6)  # room for the numbers
-            log_axis(panel, "y")
-        setp(panels[-1], xlabel="L on the hfs [10$^6$]")
-        setp(panels[:, 0].tolist(), ylabel="L on the model [10$^6$]")
-    return "Loss of disturbed weight sets, model against hfs; the numbers are rank correlations."
 
 
 def root_locus(

@@ -2,96 +2,67 @@
 
 Gradients of L in log-weights on the rigid body, through several phi (the command itself, a linear
 map, the paper's GRFM-Net, the default one with and without its legs part), against central
-differences on the high-fidelity simulator (hfs); and the order in which model and hfs put
-disturbed weight sets. The feet share one R: 18 directions.
+differences on the high-fidelity simulator (hfs). The feet share one R: 18 directions.
 
     python experiments/transfer.py --data data --out runs/transfer
 
 Walks on the hfs are stored under OUT/hfs and used by a later call: walked by MuJoCo C on the
-processes, or all at once in MJX where JAX sees an accelerator. Another controller (--effort-about,
---stance-weight) has nets of its own: name a DATA folder for it, and what is missing there is
-collected with that controller and trained. With data of another controller, only the command itself
-is compared.
-
-    python experiments/transfer.py --effort-about weight --data data-weight --out runs/weight
+processes, or all at once in MJX where JAX sees an accelerator.
 """
 
 import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, as_completed
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, NamedTuple
 
-import alignment
 import jax
 import lib
 import numpy as np
-import plots
 import tyro
-from lib import check_names, sample_weights, write_report
+from jaxtyping import Float
 
-from hector_jax.control.controller import WalkConfig
-from hector_jax.control.legs import LegConfig
-from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.weights import (
     Weights,
     direction_names,
-    expert,
+    directions,
     nominal,
     scale_weights,
+    weights_to_vector,
 )
-from hector_jax.control.weights_file import load_weights
-from hector_jax.core.console import bar, exit_code, say
-from hector_jax.core.environment import environment
+from hector_jax.core.console import bar, exit_code
 from hector_jax.core.files import make_folder
-from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.trajectory import Load, Trajectory
-from hector_jax.grfm.collection import fingerprint
 from hector_jax.grfm.effect import Effect, Window, last_command
-from hector_jax.grfm.network import Params, as_effect
+from hector_jax.grfm.network import as_effect
+from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
-from hector_jax.store import nets, tunings
-from hector_jax.store.setup import Setup
-from hector_jax.store.tunings import Problem
+from hector_jax.store import nets
 from hector_jax.tuning.difftune import TuneConfig, step_status, tune_step
 from hector_jax.tuning.loss import PAPER_LOSS, loss_of
-from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
+from hector_jax.tuning.rollout import Scenario
 from hector_jax.tuning.status import StepStatus
+from hector_jax.verdict.metrics import Interval, bootstrap
 
-PUBLISHED = {"nominal": nominal, "expert": expert}
-SETS = (*PUBLISHED, "tuned")
-FACTORS = (1.5, 3.0)  # largest factors of the weight sets of the rank correlation
+STEP = float(np.log(1.05))  # of the central differences, in log-weights
 
 
 @dataclass(frozen=True)
 class Flags:
-    """What to compare."""
+    """What to compare, at nominal weights."""
 
     data: Path = Path("data")  # walks and nets; made where missing
     out: Path = Path("runs/transfer")  # folder of the report
-    tuned: dict[str, Path] = field(default_factory=dict)  # TRAJ FILE; else tuned here
     trajectories: tuple[str, ...] = COMMANDS
-    sets: tuple[str, ...] = SETS
     phases: tuple[int, ...] = (0, 10, 20, 30)  # gait ticks at which the command starts
-    lead: int = 40  # ticks in place before t = 0 on the model, beside none
-    ranks: int = 64  # weight sets for each rank correlation; 0 leaves them out
-    about: Path | None = None  # weights about which these are drawn; nominal by default
-    effort_about: Literal["zero", "weight"] = "zero"  # MpcConfig.effort_reference
-    stance_weight: bool = False  # LegConfig.gravity_compensation
     processes: int = 2  # one core each
-
-    def __post_init__(self) -> None:
-        if not self.sets:
-            raise InputError(f"Flags.sets must name one at least of {', '.join(SETS)}, got none")
-        check_names("sets", self.sets, SETS)
-        check_names("tuned", self.tuned, self.trajectories)
 
 
 class Walked(NamedTuple):
@@ -99,30 +70,53 @@ class Walked(NamedTuple):
 
     loss: np.ndarray
     fallen: np.ndarray
-    residual: np.ndarray  # largest of a plan
 
 
-class Result(NamedTuple):
-    """All numbers of the report.
+class Row(NamedTuple):
+    """A phi against the simulator, on a trajectory."""
 
-    Gradients are (sets, trajectories, phases, 18), losses of sampled weight sets (trajectories,
-    factors, sets, phases); those of the model are by phi.
+    cosine: Interval
+    wrong: str  # the weight whose entry differs most between the unit gradients
+    share: float  # of the squared distance between the unit gradients, due to that weight
+    phases: int  # with finite gradients in both
+
+
+Gradients = Float[np.ndarray, "phases 18"]
+
+
+def as_directions(weights: Weights, gradient: Weights) -> Float[np.ndarray, "18"]:
+    """Convert a gradient in weights to the 18 directions."""
+    logs = np.asarray(weights_to_vector(gradient)) * np.asarray(weights_to_vector(weights))
+    return directions() @ logs
+
+
+def slopes(losses: Float[np.ndarray, "*batch 18 2"]) -> Float[np.ndarray, "*batch 18"]:
+    """Compute central differences of losses a STEP up and a STEP down."""
+    return (losses[..., 0] - losses[..., 1]) / (2.0 * STEP)
+
+
+def _cosine(model: np.ndarray, simulator: np.ndarray) -> np.ndarray | float:
+    """Compute the cosine of the angle between means over phases."""
+    a, b = model.mean(axis=-2), simulator.mean(axis=-2)
+    return np.sum(a * b, axis=-1) / (np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1))
+
+
+def compare(model: Gradients, simulator: Gradients) -> Row | None:
+    """Compare gradients; phases with a number that is not finite are left out, None if all are.
+
+    The interval redraws the same phases for both. With a handful it is narrow rather than wide, and
+    it says nothing of other commands.
     """
-
-    engine: str  # of the walks on the hfs
-    walked: Mapping[str, Walked]  # walks on the hfs, by group
-    truth: np.ndarray  # gradients on the hfs
-    gradients: Mapping[str, np.ndarray]
-    hfs_losses: np.ndarray
-    losses: Mapping[str, np.ndarray]
-
-
-class Point(NamedTuple):
-    """Point of evaluation of a gradient or a loss."""
-
-    weights: Weights
-    command: Command
-    tick: int  # of t = 0
+    finite = np.isfinite(model + simulator).all(axis=1)
+    if not finite.any():
+        return None
+    model, simulator = model[finite], simulator[finite]
+    a, b = (x.mean(axis=0) / np.linalg.norm(x.mean(axis=0)) for x in (model, simulator))
+    distances = (a - b) ** 2  # sums to 2 (1 - cosine)
+    worst = int(np.argmax(distances))
+    share = float(distances[worst] / max(distances.sum(), 1e-12))
+    cosine = bootstrap(_cosine, model, simulator)
+    return Row(cosine, direction_names()[worst], share, int(finite.sum()))
 
 
 def _without_legs(effect: jax.tree_util.Partial, window: Window) -> Effect:
@@ -130,339 +124,144 @@ def _without_legs(effect: jax.tree_util.Partial, window: Window) -> Effect:
     return loads._replace(legs=Load(*(0.0 * part for part in loads.legs)))
 
 
-def phis(
-    pool: Executor, config: TuneConfig, robot: Robot, data: Path
-) -> tuple[dict, Params | None]:
-    """Return each phi by name, and the parameters of the default net; None for other data."""
-    walks = data / "walks"
-    effects = {"command": last_command}
-    if (walks / "card.json").exists():
-        if fingerprint(walks).get("controller") != repr(config.rollout.walk):
-            say(
-                f"{walks}: walked by another controller; only the command itself is compared. "
-                "A --data folder of its own gives this one nets"
-            )
-            return effects, None
+def phis(pool: Executor, robot: Robot, data: Path) -> dict[str, jax.tree_util.Partial]:
+    """Return each phi by name; nets are trained if missing."""
     net, paper = (nets.load_or_train(pool, robot, data, name) for name in ("residual", "paper"))
     default = as_effect(net.params)
-    effects |= {
+    effects = {
+        "command": last_command,
         "linear": as_effect(net.linear),
         "paper": as_effect(paper.params),
         "net": default,
         "net without legs": jax.tree_util.Partial(_without_legs, default),
     }
     host = partial(jax.tree.map, np.asarray)  # inputs of a process must not be on a device
-    return {name: host(effect) for name, effect in effects.items()}, net.params
+    return {name: host(effect) for name, effect in effects.items()}
 
 
-def tuned_sets(
-    pool: Executor,
-    flags: Flags,
-    config: TuneConfig,
-    robot: Robot,
-    params: Params | None,
-    loaded: Mapping[str, Weights],
-) -> dict[str, Weights]:
-    """Return tuned weights by trajectory; tune if necessary."""
-    problems = {
-        name: Problem((named_command(name),), params)
-        for name in flags.trajectories
-        if name not in loaded
-    }
-    setup = Setup(pool, config, robot, environment().get("commit", ""))
-    results = tunings.tune_all(setup, problems, flags.out, title="tuning")
-    return {**loaded, **{name: tuned.tuning.weights for name, tuned in results.items()}}
-
-
-def _walked(walk: Trajectory) -> Walked:
-    loss = loss_of(PAPER_LOSS, walk)
-    return Walked(np.asarray(loss), walk.fallen.any(), walk.residual.max())
-
-
-def walk_groups(
-    pool: Executor,
-    config: WalkConfig,
-    robot: Robot,
-    groups: Mapping[str, Sequence[Job]],
-    folder: Path,
-) -> tuple[dict[str, Walked], str]:
-    """Walk groups of jobs on the hfs; returns the results and the engine. Groups are cached."""
-    engine = choose_engine("auto")
-    walked = lib.walk_groups(
-        groups,
-        partial(engine.walk, pool, config, robot),
-        _walked,
-        like=Walked(np.zeros(0), np.zeros(0), np.zeros(0)),
-        kind="transfer",
-        robot=robot,
-        folder=folder,
-        settings=(config, repr(PAPER_LOSS), engine.name),
-        title=f" on the high-fidelity simulator, engine {engine.name}",
-    )
-    return walked, engine.name
-
-
-def gradient_jobs(point: Point, phases: Sequence[int]) -> list[Job]:
-    """Return the walks of the gradients at a weight set: by phase, direction and side."""
-    steps = alignment.STEP * np.eye(len(direction_names()))
+def jobs(command: Command, phases: Sequence[int]) -> list[Job]:
+    """Return the walks of a gradient on the hfs: by phase, direction and side."""
+    steps = STEP * np.eye(len(direction_names()))
     return [
-        Job(
-            jax.device_get(scale_weights(point.weights, side * step)),
-            point.command,
-            hfs(),
-            start_tick=phase,
-        )
+        Job(jax.device_get(scale_weights(nominal(), side * step)), command, hfs(), start_tick=phase)
         for phase in phases
         for step in steps
         for side in (1, -1)
     ]
 
 
-@partial(jax.jit, static_argnums=0)
-def _model_loss(config: TuneConfig, scenario: Scenario, weights: Weights) -> jax.Array:
-    return loss_of(config.loss, rollout(config.rollout, scenario, weights))
+def _walked(walk: Trajectory) -> Walked:
+    return Walked(np.asarray(loss_of(PAPER_LOSS, walk)), walk.fallen.any())
 
 
-def _model_job(
-    config: TuneConfig,
-    robot: Robot,
-    effect: jax.tree_util.Partial,
-    points: Sequence[Point],
-    others: Sequence[Point],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute gradients at points, NaN if rejected, and losses at others; in a worker."""
-    rows = []
-    for weights, command, tick in points:
-        scenario = Scenario(robot, command, standing_anchor(robot, tick), effect)
-        evaluation = jax.device_get(tune_step(config, scenario, weights))
-        row = alignment.as_directions(weights, evaluation.gradient)
+def simulator_gradients(pool: Executor, flags: Flags, robot: Robot) -> dict[str, Gradients]:
+    """Return central differences on the hfs by trajectory, NaN where a walk fell."""
+    config, engine = TuneConfig().rollout.walk, choose_engine("auto")
+    walked = lib.walk_groups(
+        {name: jobs(named_command(name), flags.phases) for name in flags.trajectories},
+        partial(engine.walk, pool, config, robot),
+        _walked,
+        like=Walked(np.zeros(0), np.zeros(0)),
+        kind="transfer",
+        robot=robot,
+        folder=flags.out / "hfs",
+        settings=(config, repr(PAPER_LOSS), engine.name),
+        title=f" on the high-fidelity simulator, engine {engine.name}",
+    )
+    shape = len(flags.phases), len(direction_names()), 2
+    losses = {name: np.where(one.fallen, np.nan, one.loss) for name, one in walked.items()}
+    return {name: slopes(loss.reshape(shape)) for name, loss in losses.items()}
+
+
+def model_gradients(
+    robot: Robot, effect: jax.tree_util.Partial, command: Command, phases: Sequence[int]
+) -> Gradients:
+    """Return gradients through a phi, NaN where the tuner rejects one; in a worker."""
+    config, rows = TuneConfig(), []
+    for phase in phases:
+        scenario = Scenario(robot, command, standing_anchor(robot, phase), effect)
+        evaluation = jax.device_get(tune_step(config, scenario, nominal()))
+        row = as_directions(nominal(), evaluation.gradient)
         accepted = step_status(config, evaluation) == StepStatus.ACCEPTED
         rows.append(np.where(accepted, row, np.nan))
-    losses = [
-        float(
-            _model_loss(
-                config, Scenario(robot, command, standing_anchor(robot, tick), effect), weights
-            )
-        )
-        for weights, command, tick in others
-    ]
-    return np.array(rows), np.array(losses)
+    return np.array(rows)
 
 
-def measure(flags: Flags, loaded: Mapping[str, Weights], center: Weights) -> Result:
-    """Evaluate gradients and losses on the model and on the hfs.
-
-    Args:
-        flags: what to compare.
-        loaded: tuned weights by trajectory; those of other trajectories are tuned here.
-        center: weights about which the sets of the rank correlations are drawn.
-    """
+def measure(flags: Flags) -> dict[str, dict[str, Gradients]]:
+    """Return gradients by trajectory, then by phi; those of the simulator as "hfs"."""
     robot = jax.tree.map(np.asarray, load_robot())
-    walk = WalkConfig(
-        mpc=MpcConfig(effort_reference="gravity" if flags.effort_about == "weight" else "zero"),
-        legs=LegConfig(gravity_compensation=flags.stance_weight),
-    )
-    configs = {
-        f", lead {lead}" if lead else "": TuneConfig(rollout=RolloutConfig(walk=walk, lead=lead))
-        for lead in sorted({0, flags.lead})
-    }
-    commands = {name: named_command(name) for name in flags.trajectories}
-    sampled = {
-        f"ranks-{name}-{factor:g}": [
-            Point(weights, command, tick)
-            for weights in sample_weights(center, factor, flags.ranks)
-            for tick in flags.phases
-        ]
-        for name, command in commands.items()
-        for factor in FACTORS
-        if flags.ranks
-    }
     with workers(flags.processes) as pool:
-        effects, params = phis(pool, configs[""], robot, flags.data)
-        sets = {which: dict.fromkeys(commands, w()) for which, w in PUBLISHED.items()}
-        if "tuned" in flags.sets:
-            sets["tuned"] = tuned_sets(pool, flags, configs[""], robot, params, loaded)
-        starts = {
-            f"{which}-{name}": Point(sets[which][name], command, 0)
-            for which in flags.sets
-            for name, command in commands.items()
-        }
-        groups = {key: gradient_jobs(start, flags.phases) for key, start in starts.items()}
-        for key, points in sampled.items():
-            groups[key] = [Job(p.weights, p.command, hfs(), start_tick=p.tick) for p in points]
-        anchored = [start._replace(tick=tick) for start in starts.values() for tick in flags.phases]
-        others = [point for points in sampled.values() for point in points]
-        # An accelerator walks while the processes differentiate; without one the walks come after.
+        effects = phis(pool, robot, flags.data)
         running = {
-            name + ending: pool.submit(_model_job, config, robot, effect, anchored, others)
-            for ending, config in configs.items()
-            for name, effect in effects.items()
+            (name, kind): pool.submit(
+                model_gradients, robot, effect, named_command(name), flags.phases
+            )
+            for name in flags.trajectories
+            for kind, effect in effects.items()
         }
-        walked, engine = walk_groups(pool, walk, robot, groups, flags.out / "hfs")
         with bar("gradients on the rigid body") as report_progress:
             for done, _ in enumerate(as_completed(running.values()), 1):
                 report_progress(done, len(running), "")
-    shape = len(flags.sets), len(commands), len(flags.phases)
-    losses = [np.where(walked[key].fallen, np.nan, walked[key].loss) for key in starts]
-    clouds = len(commands), len(FACTORS), flags.ranks, len(flags.phases)
-    return Result(
-        engine,
-        walked,
-        truth=alignment.slopes(np.reshape(losses, (*shape, -1, 2))),
-        gradients={kind: job.result()[0].reshape(*shape, -1) for kind, job in running.items()},
-        hfs_losses=np.reshape([walked[key].loss for key in sampled], clouds),
-        losses={kind: job.result()[1].reshape(clouds) for kind, job in running.items()},
-    )
-
-
-def compare_gradients(flags: Flags, result: Result) -> dict[str, alignment.Rows]:
-    """Return the rows of the report's tables by weight set, then by trajectory and phi."""
-    rows = {}
-    for i, which in enumerate(flags.sets):
-        rows[which] = {}
-        for j, name in enumerate(flags.trajectories):
-            for kind, gradients in result.gradients.items():
-                plain, comma, lead = kind.partition(",")
-                base = result.gradients[f"command{comma}{lead}"][i, j]
-                rows[which][name, kind] = alignment.compare(
-                    gradients[i, j], None if plain == "command" else base, result.truth[i, j]
-                )
-    return rows
-
-
-def compare_orders(flags: Flags, result: Result) -> dict[tuple[str, str], dict[str, float]]:
-    """Return rank correlations by trajectory and phi, then by factor."""
-    pairs = {kind: (losses, result.hfs_losses) for kind, losses in result.losses.items()}
-    if len(flags.phases) > 1:  # agreement of the simulator with itself
-        pairs["hfs, other phases"] = result.hfs_losses[..., ::2], result.hfs_losses[..., 1::2]
+        truth = simulator_gradients(pool, flags, robot)
     return {
-        (name, kind): {
-            f"{factor:g}": alignment.rank_correlation(a[i, j].mean(axis=-1), b[i, j].mean(axis=-1))
-            for j, factor in enumerate(FACTORS)
-        }
-        for i, name in enumerate(flags.trajectories)
-        for kind, (a, b) in pairs.items()
-        if flags.ranks
+        name: {"hfs": truth[name], **{kind: running[name, kind].result() for kind in effects}}
+        for name in flags.trajectories
     }
 
 
-def report(flags: Flags, result: Result) -> Path:
-    """Write the report with its pictures and its numbers as JSON; returns its path."""
-    rows, ranks = compare_gradients(flags, result), compare_orders(flags, result)
-    fell = {name: int(w.fallen.sum()) for name, w in result.walked.items() if w.fallen.any()}
-    residual = max(float(walks.residual.max()) for walks in result.walked.values())
-    paragraphs = _introduction(flags, result, fell, residual)
-    for which, set_rows in rows.items():
-        paragraphs += [f"## {which.capitalize()} weights"]
-        paragraphs += [alignment.summary(set_rows, "net")] if "net" in result.gradients else []
-        sentences = [
-            f"- {alignment.wrong_sentence(name, kind, row)}"
-            for (name, kind), row in set_rows.items()
-            if row is not None and kind in ("command", "net")
-        ]
-        paragraphs += [alignment.gradient_table(set_rows), "\n".join(sentences)]
-    if ranks:
-        paragraphs += [
-            "## Order of weight sets",
-            f"Spearman's rank correlation of L on the model and on the hfs over {flags.ranks} "
-            f"weight sets, drawn log-uniformly about {flags.about or 'nominal'}, each loss the "
-            "mean over the start phases; a fall counts as the loss charges it. `hfs, other phases` "
-            "is the correlation of the simulator with itself, every other phase against the rest.",
-            alignment.rank_table(ranks),
-        ]
-    numbers = {
-        "flags": {k: v for k, v in vars(flags).items() if not isinstance(v, Path | dict)},
-        "engine": result.engine,
-        "weights": direction_names(),
-        "rows": {
-            which: {": ".join(key): alignment.as_result(row) for key, row in set_rows.items()}
-            for which, set_rows in rows.items()
-        },
-        "ranks": {": ".join(key): row for key, row in ranks.items()},
-        "fell": fell,
-        "residual": residual,
-        "gradients": {
-            f"{which}: {name}": {
-                kind: gradients[i, j].tolist()
-                for kind, gradients in {"hfs": result.truth, **result.gradients}.items()
-            }
-            for i, which in enumerate(flags.sets)
-            for j, name in enumerate(flags.trajectories)
-        },
+def table(rows: Mapping[str, Mapping[str, Row | None]]) -> str:
+    """Return the table by trajectory and phi."""
+    lines = []
+    for name, by_phi in rows.items():
+        for kind, row in by_phi.items():
+            cells = ("no phase to compare", "")
+            if row is not None:
+                cells = (row.cosine.text("{:.2f}".format), f"{row.wrong}, {row.share:.0%}")
+            lines.append((name, kind, *cells))
+    return markdown_table(("trajectory", "phi", "cosine", "most wrong"), lines, words=2)
+
+
+def report(flags: Flags, gradients: Mapping[str, Mapping[str, Gradients]]) -> Path:
+    """Write the report and its numbers; returns its path."""
+    rows = {
+        name: {kind: compare(one, each["hfs"]) for kind, one in each.items() if kind != "hfs"}
+        for name, each in gradients.items()
     }
-    return write_report(
+
+    def as_result(row: Row | None) -> Any:
+        return row and row._asdict() | {"cosine": row.cosine._asdict()}
+
+    return lib.write_report(
         flags.out / "report.md",
         "Does the gradient transfer?",
-        [*paragraphs, "## Pictures"],
-        numbers=numbers,
+        [
+            "Cosine between the model's gradient of L in 18 log-weights at nominal weights and the "
+            "high-fidelity simulator's, by central differences of +-5 %. Both are means over "
+            f"{len(flags.phases)} start phases; intervals redraw these, the same ones for both. "
+            "`most wrong` names the weight whose entry differs most between the unit gradients, "
+            "and its share of their squared distance.",
+            table(rows),
+        ],
+        numbers={
+            "weights": direction_names(),
+            "phases": flags.phases,
+            "rows": {n: {k: as_result(row) for k, row in each.items()} for n, each in rows.items()},
+            "gradients": {
+                name: {kind: one.tolist() for kind, one in each.items()}
+                for name, each in gradients.items()
+            },
+        },
         json_name="transfer.json",
-        pictures=_draw(flags, result, ranks),
     )
-
-
-def _introduction(
-    flags: Flags, result: Result, fell: Mapping[str, int], residual: float
-) -> list[str]:
-    falls = ", ".join(f"{name} {count}" for name, count in fell.items())
-    falls += " (phases with a fall are left out of the gradients)" if fell else "none"
-    count = sum(len(walks.loss) for walks in result.walked.values())
-    return [
-        f"The model's gradient of L in 18 log-weights against that of the high-fidelity simulator: "
-        f"central differences of +-5 %, mean over the start phases (gait ticks "
-        f"{', '.join(map(str, flags.phases))}). Controller: effort priced about "
-        f"{flags.effort_about}, leg weight in the stance torque "
-        f"{'on' if flags.stance_weight else 'off'}. {count} walks, engine {result.engine}; worst "
-        f"relative KKT residual {residual:.0e}; falls: {falls}.",
-        "Brackets are 95 % intervals from redrawing the start phases, the same ones for model and "
-        f"simulator. There are {len(flags.phases)}: with so few the intervals are rough, rather "
-        "too narrow (of one phase there is none), and say nothing of other commands or plants.",
-        "`command` is the plain rigid body; `lead` counts ticks that the model walks in place "
-        "before t = 0. `most wrong` names the weight whose entry differs most between the two unit "
-        "gradients, and its share of their squared distance.",
-    ]
-
-
-def _draw(
-    flags: Flags, result: Result, ranks: Mapping[tuple[str, str], Mapping[str, float]]
-) -> dict[str, str]:
-    """Draw the pictures, all without lead; returns their captions by name."""
-    plain = [kind for kind in result.gradients if "," not in kind]
-    captions = {}
-    for j, name in enumerate(flags.trajectories):
-        simulator = result.truth[0, j]
-        models = {kind: result.gradients[kind][0, j] for kind in plain}
-        finite = np.isfinite(simulator + sum(models.values())).all(axis=1)
-        if finite.any():
-            file = f"gradients-{name}.png"
-            models = {kind: rows[finite] for kind, rows in models.items()}
-            caption = plots.gradients(
-                flags.out / file, direction_names(), simulator[finite], models
-            )
-            captions[file] = f"{name}, {flags.sets[0]} weights. {caption}"
-    if ranks:
-        keys = [(name, f"{factor:g}") for name in flags.trajectories for factor in FACTORS]
-
-        def by_key(losses: np.ndarray) -> dict[tuple[str, str], np.ndarray]:
-            return dict(zip(keys, losses.mean(axis=-1).reshape(len(keys), -1), strict=True))
-
-        model = {kind: by_key(result.losses[kind]) for kind in plain}
-        captions["ranks.png"] = plots.ranks(
-            flags.out / "ranks.png",
-            by_key(result.hfs_losses),
-            {key: {kind: model[kind][key] for kind in plain} for key in keys},
-            {key: {kind: ranks[key[0], kind][key[1]] for kind in plain} for key in keys},
-        )
-    return captions
 
 
 def main() -> None:
-    """Write report.md, transfer.json and the pictures."""
+    """Write report.md and transfer.json."""
     flags = tyro.cli(Flags)
+    lib.check_names("trajectories", flags.trajectories, COMMANDS)
     setup_jax()
-    loaded = {name: load_weights(path) for name, path in flags.tuned.items()}
-    center = load_weights(flags.about) if flags.about else nominal()
     make_folder(flags.out)
-    print(report(flags, measure(flags, loaded, center)))
+    print(report(flags, measure(flags)))
 
 
 if __name__ == "__main__":
