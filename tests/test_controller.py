@@ -12,6 +12,7 @@ from hector_jax.control.controller import (
     actuate,
     contacts_needed,
     init_memory,
+    limit_distance,
     measured_feet,
     plan,
     plan_horizon,
@@ -19,7 +20,7 @@ from hector_jax.control.controller import (
 )
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.legs import Measurement, stance_torques, trunk_position
-from hector_jax.control.mpc import Horizon, MpcConfig, limit_distance
+from hector_jax.control.mpc import Horizon, MpcConfig
 from hector_jax.control.parameters import TUNABLES, Q
 from hector_jax.control.reference import Anchor, named_command
 from hector_jax.control.weights import expert

@@ -16,8 +16,11 @@ from hector_jax.control.contact import (
     LINE_FRICTION,
     Contact,
     InputConstraint,
+    InputCost,
     Rows,
+    Squares,
     StateConstraint,
+    StateCost,
 )
 from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, build_qp, half_slope, solve_mpc
@@ -354,6 +357,29 @@ def test_the_first_pose_which_no_input_moves_can_be_left_unbounded():
 
     assert status(low) == Status.INFEASIBLE
     assert status(-np.inf) == Status.SOLVED
+
+
+def test_costs_of_ones_own_are_added_to_those_of_the_weights():
+    def place(step):
+        return Squares(step.state.position, step.reference.position, 70.0)
+
+    def load(contact):
+        return Squares(contact.force[2:], 0.0, 2e-4)
+
+    own = StateCost("place", of=place), InputCost("load", of=load)
+    base, (state, horizon) = expert(), problem(3, push=2.0)
+    heavy = base._replace(
+        Q=base.Q._replace(position=base.Q.position + 70.0),
+        R=base.R._replace(force=base.R.force + np.array([0.0, 0.0, 2e-4])),
+    )
+    for max_contacts in (1, 2):
+        expected, _ = solve(CONFIG, heavy, state, horizon, max_contacts)
+        config = replace(CONFIG, costs=own)
+        got, solution = solve(config, base, state, horizon, max_contacts)
+        np.testing.assert_allclose(pack_wrench(got), pack_wrench(expected), atol=1e-6)
+        assert solution.status == Status.SOLVED
+    plain, _ = solve(CONFIG, base, state, horizon, 1)
+    assert np.abs(pack_wrench(plain) - pack_wrench(expected)).max() > 0.1
 
 
 def test_constraints_are_chosen_by_name_in_files():

@@ -10,8 +10,11 @@ from hector_jax.control.contact import (
     Contact,
     ContactModel,
     InputConstraint,
+    InputCost,
     Rows,
+    Squares,
     StateConstraint,
+    StateCost,
     Step,
 )
 from hector_jax.control.controller import (
@@ -42,9 +45,9 @@ from hector_jax.control.weights import Weights, expert, nominal
 # fmt: off
 __all__ = [
     "FootstepConfig", "GaitConfig", "LegConfig", "LINE_FOOT", "Anchor", "Command", "Contact",
-    "ContactModel", "Horizon", "InputConstraint", "Measurement", "Memory", "MpcConfig",
-    "MpcProblem", "NamedCommand", "Parameters", "Plan", "Rows", "StateConstraint", "Step",
-    "Tunable", "WalkConfig", "Weights", "actuate", "build_qp", "command_of", "expert",
-    "init_memory", "named_command", "nominal", "plan", "reference_at", "solve_mpc",
-    "standing_anchor", "step_plan", "walk_config",
+    "ContactModel", "Horizon", "InputConstraint", "InputCost", "Measurement", "Memory",
+    "MpcConfig", "MpcProblem", "NamedCommand", "Parameters", "Plan", "Rows", "Squares",
+    "StateConstraint", "StateCost", "Step", "Tunable", "WalkConfig", "Weights", "actuate",
+    "build_qp", "command_of", "expert", "init_memory", "named_command", "nominal", "plan",
+    "reference_at", "solve_mpc", "standing_anchor", "step_plan", "walk_config",
 ]

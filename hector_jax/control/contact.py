@@ -137,11 +137,39 @@ class StateConstraint(Constraint):
     on = "states"
 
 
-def rows(constraint: Constraint, argument: Contact | Step, like: Array) -> Rows:
-    """Return the rows of a constraint on a contact or step, bounds per row, dtype as `like`."""
-    A, lower, upper = constraint.of(argument)
-    bounds = (jnp.broadcast_to(jnp.asarray(b, like.dtype), A.shape[:1]) for b in (lower, upper))
-    return Rows(jnp.asarray(A, like.dtype), *bounds)
+class Squares(NamedTuple):
+    """Cost: the sum of weight (A z - target)^2; both are numbers or have an entry for each row."""
+
+    A: Float[Array, "rows z"]
+    target: Any
+    weight: Any
+
+
+class Cost(Part):
+    """Cost of the MPC beside Q and R."""
+
+    on: ClassVar[str]
+    of: Callable[..., Squares]
+    known = ()
+
+
+class InputCost(Cost):
+    """Cost on the inputs of each contact, `of(contact: Contact)`."""
+
+    on = "inputs"
+
+
+class StateCost(Cost):
+    """Cost on the state at the end of each step, `of(step: Step)`."""
+
+    on = "states"
+
+
+def rows(part: Constraint | Cost, argument: Contact | Step, like: Array) -> tuple[Array, ...]:
+    """Return the rows of a part on a contact or step with two numbers per row, dtype as `like`."""
+    A, *numbers = part.of(argument)
+    wide = (jnp.broadcast_to(jnp.asarray(x, like.dtype), A.shape[:1]) for x in numbers)
+    return jnp.asarray(A, like.dtype), *wide
 
 
 def _by_sign(signs: list[int], A: list[Array]) -> Rows:

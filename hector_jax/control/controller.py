@@ -20,7 +20,7 @@ from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance, integrat
 from hector_jax.control.footstep import Feet, FootstepConfig, FootstepParameters
 from hector_jax.control.gait import PATTERNS, GaitConfig
 from hector_jax.control.legs import LegConfig, LegParameters, Measurement
-from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, limit_distance, solve_mpc
+from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
 from hector_jax.control.parameters import TUNABLES, Parameters
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.slip import Grip, SlipConfig, feel, first_grip
@@ -188,6 +188,26 @@ def plan_horizon(
         contact=gait.contact(ticks, middles),
     )
     return horizon, touchdowns[0]
+
+
+def limit_distance(
+    horizon: Horizon, state: State, reference: State, limit: float | Float[Array, ""]
+) -> Horizon:
+    """Shift the reference horizontally so that it is at most `limit` [m] away from the robot now.
+
+    A push or a slip moves the robot further than tracking ever does. Weights that track tightly
+    would ask for all the friction there is to pull it back, and it would fall.
+
+    Args:
+        horizon: of the MPC.
+        state, reference: current and desired base state.
+        limit: largest distance; infinite: no shift.
+    """
+    away = (state.position - reference.position).at[2].set(0.0)
+    distance = jnp.sqrt(jnp.sum(away**2) + 1e-12)  # has a derivative at zero
+    shift = away * (jnp.maximum(distance - limit, 0.0) / distance)
+    moved = horizon.reference._replace(position=horizon.reference.position + shift)
+    return horizon._replace(reference=moved)
 
 
 def plan(

@@ -1,6 +1,6 @@
 r"""The walking MPC as the smallest QP: cost and constraints of Eq. 3-4 -> stance inputs -> wrench.
 
-    minimise    sum_{k=1}^{N} |x_k - x_ref,k|^2_Q + sum_{k=0}^{N-1} |u_k|^2_R
+    minimise    sum_{k=1}^{N} |x_k - x_ref,k|^2_Q + sum_{k=0}^{N-1} |u_k|^2_R + own costs
     subject to  x_{k+1} = A_k x_k + B_k u_k            dynamics
                 lower <= C u_k <= upper                each stance foot: `contact`
                 F = M = 0                              each foot in the air
@@ -10,11 +10,12 @@ contact model. `max_contacts` is the largest number of feet in stance at once; i
 the inputs of the others have zero columns and a unit Hessian, so that shapes stay static.
 
 Differences from the paper: the cost is on x_1..x_N instead of x_0..x_{N-1}, because x_0 is given; a
-foot in the air has no M_z; the reference may be shifted towards the robot, see `limit_distance`;
+foot in the air has no M_z; the reference may be shifted towards the robot, see `controller`;
 see also `contact`.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, NamedTuple
@@ -30,7 +31,9 @@ from hector_jax.control.contact import (
     Constraint,
     Contact,
     ContactModel,
+    Cost,
     Rows,
+    Squares,
     Step,
     rows,
 )
@@ -53,7 +56,7 @@ class MpcParameters(NamedTuple):
     friction: Any  # mu
     max_force: Any  # [N] per foot
     effort_reference: Any  # share of the robot's weight in the force reference of R
-    position_limit: Any  # [m] see `limit_distance`
+    position_limit: Any  # [m] see `controller.limit_distance`
     integral: IntegralGains
 
 
@@ -80,6 +83,7 @@ class MpcConfig:
     qp: QpConfig = QpConfig()
     contact: ContactModel = LINE_FOOT
     constraints: tuple[Constraint, ...] = ()  # none: those of the contact model
+    costs: tuple[Cost, ...] = ()  # beside Q and R
 
     def __post_init__(self) -> None:
         share, words = Range(0.0, 1.0, above=True), ("zero", "gravity")
@@ -127,26 +131,6 @@ class Horizon(NamedTuple):
     lever: Float[Array, "N feet 3"]  # centre of mass to foot points [m]
     foot_yaw: Float[Array, "N feet"]  # [rad]
     contact: Bool[Array, "N feet"]
-
-
-def limit_distance(
-    horizon: Horizon, state: State, reference: State, limit: float | Float[Array, ""]
-) -> Horizon:
-    """Shift the reference horizontally so that it is at most `limit` [m] away from the robot now.
-
-    A push or a slip moves the robot further than tracking ever does. Weights that track tightly
-    would ask for all the friction there is to pull it back, and it would fall.
-
-    Args:
-        horizon: of the MPC.
-        state, reference: current and desired base state.
-        limit: largest distance; infinite: no shift.
-    """
-    away = (state.position - reference.position).at[2].set(0.0)
-    distance = jnp.sqrt(jnp.sum(away**2) + 1e-12)  # has a derivative at zero
-    shift = away * (jnp.maximum(distance - limit, 0.0) / distance)
-    moved = horizon.reference._replace(position=horizon.reference.position + shift)
-    return horizon._replace(reference=moved)
 
 
 class MpcProblem(NamedTuple):
@@ -263,7 +247,11 @@ def half_slope(
     weight = share[:, None] * jnp.asarray(up.ravel(), later.dtype)
     effort = contract("kui,ki->ku", G, v) - parameters.effort_reference * weight
     slope = contract("jxb,jx->jb", turn, torque) + contract("jxb,jx->jb", push, force)
-    return slope + contract("kui,u,ku->ki", G, R, effort) + _no_foot(config, condensed) * v
+    slope = slope + contract("kui,u,ku->ki", G, R, effort) + _no_foot(config, condensed) * v
+    if config.costs:
+        A, target, weight = own_costs(config, problem, condensed)
+        slope += (A.T @ (weight * (A @ v.ravel() - target))).reshape(v.shape)
+    return slope
 
 
 def _no_foot(config: MpcConfig, condensed: Condensed) -> Float[Array, "N b"]:
@@ -287,31 +275,39 @@ def half_hessian(
     spin = block_diagonal(turn)
     pushing = overlap[..., None] * Q.velocity + (travel.T @ travel)[..., None] * Q.position
     pushed = contract("ixa,ixjb->iajb", push, contract("ijx,jxb->ixjb", pushing, push))
-    return spin.T @ (turning @ spin) + pushed.reshape(N * b, N * b) + block_diagonal(effort)
+    P = spin.T @ (turning @ spin) + pushed.reshape(N * b, N * b) + block_diagonal(effort)
+    if config.costs:
+        A, _, weight = own_costs(config, problem, condensed)
+        P += A.T @ (weight[:, None] * A)
+    return P
 
 
-def input_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> Rows:
-    """Return the rows of constraints on inputs, block-diagonal by step: A is (N, rows, b)."""
+def _on_contacts(
+    config: MpcConfig, problem: MpcProblem, condensed: Condensed, parts: Sequence[Any]
+) -> tuple[Array, ...]:
+    """Return rows of parts on inputs, block-diagonal by step (N, rows, b), and their numbers."""
     feet, (robot, parameters, _, horizon, _) = condensed.feet, problem
     selection = jnp.asarray(config.contact.selection, feet.dtype)
     robot = robot._replace(half_width=config.sole_width * robot.half_width)
 
-    def of_contact(yaw: Float[Array, ""]) -> Rows:
+    def of_contact(yaw: Float[Array, ""]) -> tuple[Array, ...]:
         contact = Contact(
             selection[:3], selection[3:], yaw, robot, parameters.friction, parameters.max_force
         )
-        parts = [rows(constraint, contact, feet) for constraint in config.on("inputs")]
-        return Rows(*map(jnp.concatenate, zip(*parts, strict=True)))
+        each = [rows(part, contact, feet) for part in parts]
+        return tuple(map(jnp.concatenate, zip(*each, strict=True)))
 
     yaw = contract("ksf,kf->ks", feet, horizon.foot_yaw)
-    A, lower, upper = jax.vmap(jax.vmap(of_contact))(yaw)
+    A, *numbers = jax.vmap(jax.vmap(of_contact))(yaw)
     N, contacts = yaw.shape
     A = contract("st,ksri->ksrti", jnp.eye(contacts, dtype=feet.dtype), A)
-    return Rows(A.reshape(N, -1, condensed.inputs.shape[-1]), lower.ravel(), upper.ravel())
+    return A.reshape(N, -1, condensed.inputs.shape[-1]), *numbers
 
 
-def state_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> Rows:
-    """Return the rows of constraints on states, dense: A is (rows, n)."""
+def _on_states(
+    problem: MpcProblem, condensed: Condensed, parts: Sequence[Any]
+) -> tuple[Array, ...]:
+    """Return dense rows (rows, n) of parts on states, their constants, and their numbers."""
     _, _, turn, push, angles, later, travel, free = condensed
     later, travel = later[:, None, :, None], travel[:, None, :, None]
     turn_, push_ = (jnp.swapaxes(part, 0, 1) for part in (turn, push))  # (3, N, b)
@@ -319,20 +315,44 @@ def state_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> 
     states = jnp.concatenate([*poses, later * turn_, later * push_], axis=1)  # (N, 12, N, b)
     selection = State(*jnp.split(jnp.eye(12, dtype=turn.dtype), 4))
 
-    def of_step(data: tuple) -> Rows:
+    def of_step(data: tuple) -> tuple[Array, ...]:
         number, reference, contact, lever, states, free = data
         step = Step(number, selection, reference, contact, lever)
-        parts = [rows(constraint, step, turn) for constraint in config.on("states")]
-        C, lower, upper = map(jnp.concatenate, zip(*parts, strict=True))
-        constant = C @ jnp.concatenate(free)
-        return Rows(C @ states, lower - constant, upper - constant)
+        each = [rows(part, step, turn) for part in parts]
+        C, *numbers = map(jnp.concatenate, zip(*each, strict=True))
+        return C @ states, C @ jnp.concatenate(free), *numbers
 
     flat = states.reshape(*states.shape[:2], -1)
     horizon = problem.horizon
     numbers = jnp.arange(len(flat))
     steps = numbers, horizon.reference, horizon.contact, horizon.lever, flat, free
-    A, lower, upper = jax.vmap(of_step)(steps)
-    return Rows(A.reshape(-1, A.shape[-1]), lower.ravel(), upper.ravel())
+    A, *others = jax.vmap(of_step)(steps)
+    return A.reshape(-1, A.shape[-1]), *(x.ravel() for x in others)
+
+
+def input_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> Rows:
+    """Return the rows of constraints on inputs, block-diagonal by step: A is (N, rows, b)."""
+    A, lower, upper = _on_contacts(config, problem, condensed, config.on("inputs"))
+    return Rows(A, lower.ravel(), upper.ravel())
+
+
+def state_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> Rows:
+    """Return the rows of constraints on states, dense: A is (rows, n)."""
+    A, constant, lower, upper = _on_states(problem, condensed, config.on("states"))
+    return Rows(A, lower - constant, upper - constant)
+
+
+def own_costs(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> Squares:
+    """Return the costs beside Q and R as functions of the inputs, dense: A is (rows, n)."""
+    found = []
+    if parts := [cost for cost in config.costs if cost.on == "inputs"]:
+        A, target, weight = _on_contacts(config, problem, condensed, parts)
+        stands = condensed.feet.sum(axis=-1)[..., None]
+        found.append((block_diagonal(A), target.ravel(), (stands * weight).ravel()))
+    if parts := [cost for cost in config.costs if cost.on == "states"]:
+        A, constant, target, weight = _on_states(problem, condensed, parts)
+        found.append((A, target - constant, weight))
+    return Squares(*map(jnp.concatenate, zip(*found, strict=True)))
 
 
 def build_qp(
