@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from batch import member_params
 from model import LEARNS_TOUCHDOWNS
 from synthetic import synthetic_walk
 
@@ -89,14 +88,17 @@ def test_the_effect_follows_the_dtype_of_the_window(either, window, dtype):
 
 
 def test_the_members_alone_are_on_average_the_ensemble(ensemble, window):
-    members = jax.jit(jax.vmap(lambda effect: effect(window).wrench))(
-        as_effect(member_params(ensemble))
-    )
+    member = variant_of(ensemble).member
+    members = [apply(as_effect(member(ensemble, i)), window).wrench for i in range(4)]
     whole = apply(as_effect(ensemble), window).wrench
-    for each, mean in zip(members, whole, strict=True):
-        assert len(each) == 4
+    for *each, mean in zip(*members, whole, strict=True):
         assert np.ptp(each, axis=0).max() > 0
-        np.testing.assert_allclose(each.mean(axis=0), mean, rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(np.mean(each, axis=0), mean, rtol=1e-5, atol=1e-9)
+
+
+def test_a_variant_that_is_no_ensemble_is_its_own_member(params, gated, data):
+    for own in (params, gated, fit_linear(data)):
+        assert variant_of(own).member(own, 1) is own
 
 
 def test_vmap_over_windows_equals_a_loop(either, data, windows):

@@ -50,10 +50,12 @@ for _command in (
     evaluate.run_evaluate,
     evaluate.run_walk,
     evaluate.run_grfm,
+    propose.run_propose,
+    propose.run_report,
     tune.run_tune,
+    verdict.run_verdict,
+    view.run_view,
 ):
-    run.register(_command)
-for _command in (propose.run_propose, propose.run_report, verdict.run_verdict, view.run_view):
     run.register(_command)
 
 

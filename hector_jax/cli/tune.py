@@ -85,7 +85,7 @@ class _Run(NamedTuple):
     net: nets.TrainedNet
 
     @property
-    def answer(self) -> tuple[TuneConfig, Weights]:
+    def settings_of_best(self) -> tuple[TuneConfig, Weights]:
         """Settings and start of the tuning of `best`."""
         _, config, robot, _ = self.setup
         smooth, safe = self.args.smooth, self.args.safe
@@ -251,7 +251,7 @@ def _note_settings(run: _Run) -> dict[str, Any]:
 def _tune_sets(run: _Run) -> _Tuned:
     """Tune without and with the net; write the weights."""
     setup, commands = run.setup, list(run.commands.values())
-    config, start = run.answer
+    config, start = run.settings_of_best
     problem = {"best": tunings.Problem(tuple(commands), run.net.params, choice.DRAWS)}
     folder = run.folder / _ARTEFACTS
     tune_in = partial(tunings.tune_all, folder=folder, metrics=run.folder / METRICS)
@@ -289,7 +289,8 @@ def _tune_sets(run: _Run) -> _Tuned:
 
 def _campaign(run: _Run, start: Weights) -> Campaign:
     """Return the settings of the tuning on the walks of --walks, from the result of the tunings."""
-    robot, config = run.setup.robot, replace(run.answer[0], others=run.setup.config.others)
+    robot, (config, _) = run.setup.robot, run.settings_of_best
+    config = replace(config, others=run.setup.config.others)
     plants = choice.drawn_plants(robot, run.args.walk_plants) or [hfs(robot.description)]
     return Campaign(
         run.folder / "walks",

@@ -1,14 +1,17 @@
-"""Contact models of stance feet, and the constraints of the MPC.
+"""Contact models of stance feet, and the constraints and own costs of the MPC.
 
 A `ContactModel` lists the wrench components that a stance foot can exert: they are the inputs of
 the MPC, five for a line foot (no M_x). The others are zero, and so is the whole wrench of a foot in
 the air, which has no inputs. A `Constraint` is lower <= A z <= upper on the inputs of each contact
 or on the states of each step; `MpcConfig.constraints` holds any number of them. A custom one that
-limits the yaw moment of each foot to 2 N m:
+limits the yaw moment of each foot to 2 N m, beside those of a line foot:
 
 >>> def twist(contact: Contact) -> Rows:
 ...     return Rows(contact.moment[2:], -2.0, 2.0)
->>> TWIST = InputConstraint("twist", of=twist)
+>>> constraints = (*LINE_FOOT.constraints, InputConstraint("twist", of=twist))
+
+A `Cost` is a sum of weighted squares, which `MpcConfig.costs` adds to those of Q and R. Its weights
+are fixed: a gradient tunes Q, R and what `parameters` lists.
 
 Constraints of the paper (Eq. 4), for each stance foot:
 
@@ -83,7 +86,7 @@ class ContactModel(Part):
 
 
 class Contact(NamedTuple):
-    """Arguments of a constraint on a stance foot: matrices from its inputs to its wrench."""
+    """Arguments of a constraint or cost on a stance foot: matrices from inputs to wrench."""
 
     force: Float[Array, "3 inputs"]  # in the world [N]
     moment: Float[Array, "3 inputs"]  # in the foot's yaw frame [N m]
@@ -94,7 +97,7 @@ class Contact(NamedTuple):
 
 
 class Step(NamedTuple):
-    """Arguments of a constraint on the state at the end of an MPC step."""
+    """Arguments of a constraint or cost on the state at the end of an MPC step."""
 
     number: Int[Array, ""]  # 0 for the first step
     state: State  # matrices (3, 12) that select each part of the state

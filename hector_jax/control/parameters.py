@@ -103,7 +103,9 @@ TUNABLES = {
     "kp": Tunable("legs.kp", 1.0, 3000.0, each_joint=True),
     "kd": Tunable("legs.kd", 0.05, 100.0, each_joint=True),
 }
-"""Numbers that can be tuned in addition to Q and R, by their names in `Weights.others`."""
+"""Numbers that can be tuned in addition to Q and R, by their names in `Weights.others`.
+
+A new one is added here and to the choices in cli/flags.py."""
 
 _FOOTSTEPS = ("footstep_feedback", "turn_lead")
 _INTEGRAL = ("horizontal_gain", "height_gain", "tilt_gain", "yaw_gain")

@@ -22,7 +22,7 @@ P = TypeVar("P", bound="Part")
 
 
 class Part:
-    """A named value of one or two pure functions."""
+    """A named value of a config that cannot be changed, mostly of pure functions."""
 
     known: ClassVar[tuple[Any, ...]]
 

@@ -122,8 +122,8 @@ def _instance(kind: type, value: Any) -> Any:
 def _expected(kind: Any, rule: Rule | None = None) -> str:
     """Describe the values that a type and a rule allow, in words."""
     inner = get_args(kind)
-    if hasattr(kind, "known"):
-        return f"{' or '.join(map(repr, _known(kind)))}, or a {kind.__name__}"
+    if names := getattr(kind, "known", ()):
+        return f"{' or '.join(repr(str(part)) for part in names)}, or a {kind.__name__}"
     if get_origin(kind) is Annotated:
         return _expected(inner[0], next((x for x in inner if isinstance(x, Range)), rule))
     if get_origin(kind) is Literal:

@@ -220,6 +220,7 @@ _ATTENTION = """\
 // ATTENTION: R prices u less the feet's share of the weight here, u itself there: Alpha was not
 // tuned for that.
 """
+_COSTS = "// ATTENTION: tuned beside costs that the C++ controller has not: {}.\n"
 
 
 def weights_cpp(weights: Weights, config: WalkConfig, robot: Robot, *, name: str) -> str:
@@ -248,6 +249,8 @@ def weights_cpp(weights: Weights, config: WalkConfig, robot: Robot, *, name: str
     )
     others = weights_tree(weights).get("others", {}).items()
     notes = [f"// ATTENTION: walks with {name} {value}.\n" for name, value in others]
+    if mpc.costs:
+        notes.append(_COSTS.format(", ".join(map(str, mpc.costs))))
     Q = _cpp_array("Q", np.concatenate(weights.Q), _STATES)
     Alpha = _cpp_array("Alpha", input_weights(weights), _INPUTS)
     return "".join([header, _ATTENTION * bool(numbers.effort_reference), *notes, Q, Alpha])

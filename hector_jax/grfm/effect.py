@@ -51,6 +51,8 @@ class Phi(NamedTuple):
     fit: Callable[..., tuple[Any, Any]]
     apply: Callable[[Any, Window], Effect]
     widths: Callable[[Any], tuple[int, ...]] = lambda params: ()  # `hidden` of the params
+    # (params, number) -> params of one net of an ensemble; without an ensemble they stay
+    member: Callable[[Any, int], Any] = lambda params, number: params
 
 
 Vectors = TypeVar("Vectors")  # a tree of arrays whose last axis is x, y, z

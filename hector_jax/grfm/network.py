@@ -22,7 +22,7 @@ from hector_jax.grfm.residual import RESIDUAL, plain_net
 from hector_jax.robot.model import Robot
 
 VARIANTS = {phi.name: phi for phi in (RESIDUAL, PAPER, GATED, LINEAR)}
-"""Every variant by its name; whoever adds one adds it here."""
+"""Every variant by its name. A new one is added here and to the choices in cli/flags.py."""
 
 Params = Any  # of a variant: `Phi.params`
 

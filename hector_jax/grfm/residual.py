@@ -166,7 +166,9 @@ def apply(params: ResidualParams, window: Window) -> Effect:
     return Effect(gated.from_views(ground + added.mean(axis=0)), legs, shift)
 
 
-RESIDUAL = Phi("residual", ResidualParams, init, fit, apply, lambda p: nets.widths(p.force))
+RESIDUAL = Phi(
+    "residual", ResidualParams, init, fit, apply, lambda p: nets.widths(p.force), nets.member
+)
 
 
 @cache  # every rollout on the plain rigid body asks for it

@@ -1,1 +1,5 @@
-"""Search on walks, without derivatives: CMA-ES."""
+"""Which weights to walk next, from the walks so far.
+
+`few_walks` proposes with a grounded model and a surrogate, where walks are expensive; `cmaes`
+searches with thousands.
+"""

@@ -1,1 +1,6 @@
-"""The high-fidelity world."""
+"""Walks in physics engines: worlds, plants and the closed loop.
+
+`world` and `standin` draw plants, `sensing` what the controller measures; `walk` is the loop in
+MuJoCo C, `parallel` in MJX, `drake` and `pinocchio` are plants of other engines; `engine` chooses.
+`diagnosis` says why a walk fell, `margin` which delay the loops bear.
+"""

@@ -24,7 +24,6 @@ from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import plural
 from hector_jax.core.tree import stack
 from hector_jax.grfm import network
-from hector_jax.grfm.nets import member
 from hector_jax.robot.model import Robot
 from hector_jax.sim.diagnosis import not_the_weights
 from hector_jax.sim.loop import Job
@@ -84,7 +83,7 @@ def _scenarios(config: TuneConfig, robot: Robot, problem: Problem) -> list[Scena
         return [Scenario(robot, command, anchor, effect) for command in commands]
     scenarios = []
     for seed, command in enumerate(command for command in commands for _ in range(draws)):
-        net = params if params is None else member(params, seed)
+        net = params if params is None else network.variant_of(params).member(params, seed)
         tick = seed % 2 * (walk.gait.cycle // 2)
         anchor, effect = standing_anchor(robot, tick), network.effect_of(net, walk)
         variation = drawn_variation(walk, robot, seed)

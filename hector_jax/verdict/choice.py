@@ -1,9 +1,10 @@
 """The set `best`: the settings of its tuning, and its choice on plants that no evaluation uses.
 
 The rigid-body model is inexact: a tuning can gain on the model and lose on the robot, and a tuning
-on the walks of a few plants fits them better and better, at the expense of others. So points of the
-path of a tuning, its start among them, walk on drawn plants with a noisy state estimate, and the
-one that walks best is taken.
+on the walks of a few plants fits them better and better, at the expense of others. So for a robot
+with `choice_plants` in its file, points of the path of a tuning, its start among them, walk on so
+many drawn plants with a noisy state estimate, and the one that walks best is taken; for others, as
+HECTOR, it is the last accepted one.
 """
 
 from collections.abc import Sequence
