@@ -258,9 +258,8 @@ def _tune_sets(run: _Run) -> _Tuned:
     title = f"tuning {run.name} without and with GRFM-Net"
     done = tune_in(setup, run.problems, title=title, start=run.start)
     for_best = setup._replace(config=config)
-    title = (
-        f"tuning {run.name} on {plural(choice.DRAWS * len(commands), 'drawn model')}, for `best`"
-    )
+    models = plural(choice.DRAWS * len(commands), "drawn model")
+    title = f"tuning {run.name} on {models}, for `best`"
     done |= tune_in(for_best, problem, title=title, start=start, before=done)
     results = {name: entry.tuning for name, entry in done.items()}
     options = {"seconds": run.seconds, "folder": folder / "choice"}
