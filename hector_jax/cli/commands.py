@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict
 from functools import partial, singledispatch
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from hector_jax.core.environment import versions
 from hector_jax.core.files import locked, make_folder, write_file, write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
-from hector_jax.core.settings import as_toml
+from hector_jax.core.settings import as_toml, to_table
 from hector_jax.export import export
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.importing.propose import RobotProposal, propose_robot, standard_form
@@ -112,10 +111,10 @@ def run_search(args: flags.Search) -> None:
             "walks": len(result.history) * config.population,
             "best_at": result.walk,
             "stop": result.stop,
-            "search": asdict(config),
+            "search": to_table(config),
             "start": args.start,
             "engine": engine.name,
-            "rollout": asdict(tuning.rollout),
+            "rollout": to_table(tuning.rollout),
             "loss": alphas(tuning.loss),
             "versions": versions(),
         }
