@@ -230,7 +230,7 @@ def tracking():
     integral = report("integral.json")["sets"]
     yield f"On {len(integral['s']['best']['seeds'])} more plants L changes"
     rows = {
-        "nominal with integral": ("`nominal`", "that of `best`"),
+        "nominal with others of best": ("`nominal`", "those of `best`"),
         "with": ("`with`", "none"),
         "best": ("`best`", "its own"),
     }
@@ -324,6 +324,7 @@ def robots():
     yield f"{min(medians):.0f} to {max(medians):.0f} %"
     fell = {name: sum(one[name]["standin-even"]["falls"] for one in drake) for name in drake[0]}
     assert fell == {"nominal": 0, "best": 1}
+    assert results["drake"]["humanoid"]["s"]["sets"]["best"]["standin-even"]["falls"] == 1
     yield "the humanoid falls 1 time on S with `best`"
     for robot, name in PUBLISHED.items():
         runs = results["straight"][robot]

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from hector_jax.cli.flags import Tune
 from hector_jax.cli.main import main
 from hector_jax.cli.parse import as_table
-from hector_jax.control.contact import LINE_FRICTION
+from hector_jax.control.contact import LINE_FRICTION, StateCost
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
@@ -244,6 +244,9 @@ def test_the_page_says_what_the_cpp_controller_lacks_and_the_header_our_numbers(
     assert "ATTENTION" not in text
     about_weight = WalkConfig(mpc=MpcConfig(effort_reference="gravity"))
     assert "ATTENTION" in weights_cpp(nominal(), about_weight, ROBOT, name="nominal")
+    costs = (StateCost("low", of=None),)
+    own = weights_cpp(nominal(), WalkConfig(mpc=MpcConfig(costs=costs)), ROBOT, name="nominal")
+    assert "ATTENTION: tuned beside costs that the C++ controller has not: low." in own
     others = {"friction": np.array(0.4), "effort_reference": np.array(0.5)}
     tuned = weights_cpp(nominal()._replace(others=others), CONFIG, ROBOT, name="nominal")
     assert "<= 0.4 F_z <= 200 N" in tuned

@@ -12,6 +12,7 @@ import scipy.linalg
 from oracles import exact_solution, pack_state
 
 from hector_jax.control.contact import (
+    FRICTION,
     LINE_FOOT,
     LINE_FRICTION,
     Contact,
@@ -380,6 +381,35 @@ def test_costs_of_ones_own_are_added_to_those_of_the_weights():
         assert solution.status == Status.SOLVED
     plain, _ = solve(CONFIG, base, state, horizon, 1)
     assert np.abs(pack_wrench(plain) - pack_wrench(expected)).max() > 0.1
+
+
+def test_a_cost_on_forces_about_the_weight_is_that_of_the_effort_reference():
+    prices = np.array([1e-4, 2e-4, 5e-4])
+
+    def carry(contact):
+        return Squares(contact.force, jnp.array([0.0, 0.0, WEIGHT]), prices)
+
+    state, horizon = problem(3, push=2.0)
+    own = replace(CONFIG, costs=(InputCost("carry", of=carry),))
+    about_weight = replace(CONFIG, effort_reference="gravity")
+    base = expert()
+    moments = base._replace(R=base.R._replace(force=0.0 * base.R.force))
+    forces = base._replace(R=base.R._replace(force=0.0 * base.R.force + prices))
+    for contacts in (1, 2):  # one foot stands at a time
+        got = write(own, moments, state, horizon, contacts)[0]
+        expected = write(about_weight, forces, state, horizon, contacts)[0]
+        np.testing.assert_allclose(got.P, expected.P, atol=1e-12 * np.abs(expected.P).max())
+        feet = np.abs(np.asarray(expected.q)) > 0.0  # the others have no foot and no reference
+        np.testing.assert_allclose(got.q[feet], expected.q[feet], rtol=1e-9)
+        assert not np.asarray(got.q)[~feet].any()
+
+
+def test_no_constraints_are_those_of_the_contact_model_and_names_become_values():
+    assert MpcConfig(constraints=()) == CONFIG
+    assert MpcConfig(contact="line", constraints=("friction",)).constraints == (FRICTION,)
+    assert CONFIG == MpcConfig(contact="line")
+    with pytest.raises(InputError, match="did you mean 'friction'"):
+        from_table("robot.toml", MpcConfig, {"constraints": ["frictoin"]})
 
 
 def test_constraints_are_chosen_by_name_in_files():

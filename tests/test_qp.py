@@ -564,6 +564,7 @@ def test_a_batch_is_a_loop_whatever_becomes_of_its_problems(walking):
 
 
 def test_a_solver_is_a_value_and_one_of_ones_own_is_another(walking, walked):
+    assert QpConfig(solver="jaxopt") == QpConfig(JAXOPT)
     read = from_table("file", QpConfig, {"solver": "jaxopt"})
     assert (read, hash(read)) == (QpConfig(JAXOPT), hash(QpConfig(JAXOPT)))
     assert to_table(read)["solver"] == "jaxopt"

@@ -24,7 +24,7 @@ ROBOTS = REPORTS / "robots/robots.json"
 ROBUSTNESS = REPORTS / "robustness/robustness.json"
 RACE = REPORTS / "race/nominal/race.json"
 VERDICT = REPORTS / "verdict" / "verdict.json"
-INTEGRAL = REPORTS / "integral.json"  # best and nominal, with and without integral action
+INTEGRAL = REPORTS / "integral.json"  # weights and the numbers beside them, apart
 RUN = REPORTS / "run.json"  # the run whose lines README shows
 
 ERRORS = ("L_Eul", "L_pos")  # parts of the loss: attitude, position
@@ -86,7 +86,7 @@ def test_the_errors_of_the_table_are_those_of_the_files(name):
     assert "in walks of 4 s at {} m/s (C: {})".format(*speeds) in TEXT
 
 
-def test_the_share_of_the_integral_action_is_that_of_its_file():
+def test_the_share_of_the_numbers_beside_the_weights_is_that_of_their_file():
     report = json.loads(INTEGRAL.read_text())
     assert report["weights"]["best"] == tree_hash(best())
 
@@ -95,8 +95,8 @@ def test_the_share_of_the_integral_action_is_that_of_its_file():
         assert all(change["counts"] for change in each)
         return "{:.0f}, {:.0f}, {:.0f}".format(*(-change["median"] for change in each))
 
-    text = "It alone takes {} % of the loss away (straight, C, S), tuning alone {}, both {} %."
-    names = ("nominal with integral", "with", "best")
+    text = "They alone take {} % of the loss away (straight, C, S), tuned weights {}, both {} %."
+    names = ("nominal with others of best", "with", "best")
     assert text.format(*map(told, names)) in TEXT
 
 

@@ -18,6 +18,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 import msgspec
+import numpy as np
 
 from hector_jax.core.inputs import (
     InputError,
@@ -90,7 +91,9 @@ def convert(value: Any, kind: Any, rule: Rule | None = None, name: str = "") -> 
         valid, converted = False, None
     if not valid:
         words = get_args(kind) if get_origin(kind) is Literal else _known(kind)
-        hint = did_you_mean(value, words) if isinstance(value, str) else ""
+        texts = value if isinstance(value, list | tuple) else (value,)
+        other = next((x for x in texts if isinstance(x, str) and x not in words), None)
+        hint = did_you_mean(other, words) if other else ""
         message = f"must be {_expected(kind, rule)}, got {short_repr(value)}{hint}"
         raise InputError(f"{name} {message}" if name else message)
     return converted
@@ -143,12 +146,16 @@ def _expected(kind: Any, rule: Rule | None = None) -> str:
 def check(settings: Any, /, **rules: Rule) -> None:
     """Check the fields of a dataclass against their types and ranges; for `__post_init__`.
 
+    The name of a part becomes the part.
+
     Raises:
         InputError: `CLASS.FIELD must be ..., got ...`.
     """
     for field in fields(settings):
         value, name = getattr(settings, field.name), f"{type(settings).__name__}.{field.name}"
-        convert(value, field.type, rules.get(field.name), name)
+        converted = convert(value, field.type, rules.get(field.name), name)
+        if _known(field.type):  # parts in the place of their names
+            object.__setattr__(settings, field.name, converted)
         if isinstance(value, list | dict):
             raise InputError(f"{name} must be hashable, got {short_repr(value)}")
 
@@ -226,8 +233,10 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
 
 
 def to_table(settings: Any) -> Any:
-    """Convert settings to JSON values that `from_table` reads; a path becomes text."""
-    return msgspec.to_builtins(settings, enc_hook=str)
+    """Convert settings to JSON values that `from_table` reads; a path or a part becomes text."""
+    return msgspec.to_builtins(
+        settings, enc_hook=lambda x: x.item() if isinstance(x, np.generic) else str(x)
+    )
 
 
 def as_toml(table: dict[str, Any], comments: Sequence[str]) -> str:

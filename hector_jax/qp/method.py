@@ -24,7 +24,7 @@ Status. All conditions are comparisons in the normalised problem; t is the toler
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, NamedTuple, cast
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -122,7 +122,7 @@ def _solve_rounds(
 
     Both rounds are one loop, so that the active set is compiled once.
     """
-    solver = cast(Solver, config.solver)
+    solver = config.solver
 
     def attempt(state: _Best) -> _Best:
         approaches = state.running & state.approached
@@ -153,7 +153,7 @@ def _decide(
     A GPU asks its host at each loop whether it runs. So there all that follows a guess that solves
     the problem and proves P definite is one loop.
     """
-    solver = cast(Solver, config.solver)
+    solver = config.solver
     start = (solver.guess or no_guess)(tolerances, qp)
     unsolved = jnp.max(start.residuals) > tolerances.target
     first = _Best(
