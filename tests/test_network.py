@@ -11,6 +11,7 @@ from synthetic import synthetic_walk
 
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.gait import GaitConfig
+from hector_jax.control.reference import named_command
 from hector_jax.core.trajectory import Wrench
 from hector_jax.grfm import paper, residual
 from hector_jax.grfm.dataset import ACROSS, ALONG, at_interval, make_dataset, with_mirror
@@ -21,6 +22,8 @@ from hector_jax.grfm.paper import fit_linear, fit_scaling
 from hector_jax.grfm.residual import BOUND, plain_net
 from hector_jax.grfm.training import predict
 from hector_jax.robot.model import load_robot
+from hector_jax.store.tunings import Problem, rollouts_of
+from hector_jax.tuning.difftune import TuneConfig
 
 apply = jax.jit(lambda effect, window: effect(window))
 
@@ -96,9 +99,17 @@ def test_the_members_alone_are_on_average_the_ensemble(ensemble, window):
         np.testing.assert_allclose(np.mean(each, axis=0), mean, rtol=1e-5, atol=1e-9)
 
 
-def test_a_variant_that_is_no_ensemble_is_its_own_member(params, gated, data):
-    for own in (params, gated, fit_linear(data)):
-        assert variant_of(own).member(own, 1) is own
+def test_a_drawn_model_goes_through_one_member_or_the_net_that_is_no_ensemble(
+    params, gated, data, ensemble
+):
+    config, robot, command = TuneConfig(), load_robot(), named_command("straight")
+    for net in (params, gated, fit_linear(data), ensemble):
+        drawn = rollouts_of(config, robot, Problem((command,), net, draws=2))
+        for number, scenario in enumerate(drawn):
+            (used,) = scenario.effect.args
+            expected = variant_of(net).member(net, number)
+            assert (expected is net) == (net is not ensemble)
+            jax.tree.map(np.testing.assert_array_equal, used, expected)
 
 
 def test_vmap_over_windows_equals_a_loop(either, data, windows):

@@ -153,7 +153,6 @@ class Cost(Part):
 
     on: ClassVar[str]
     of: Callable[..., Squares]
-    known = ()
 
 
 class InputCost(Cost):

@@ -154,6 +154,7 @@ class Condensed(NamedTuple):
     later: Float[Array, "N N"]  # velocity after step k per velocity gained in step j
     travel: Float[Array, "N N"]  # distance after step k per velocity gained in step j
     free: State  # (N, 3) each, without inputs
+    own: Squares | None = None  # costs beside Q and R, of all inputs
 
 
 def feet_of_contacts(
@@ -215,7 +216,9 @@ def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: in
         rate + count * gained,
         speed - fall,
     )
-    return Condensed(feet, G, turn, push, angles, later, travel, free)
+    condensed = Condensed(feet, G, turn, push, angles, later, travel, free)
+    own = own_costs(config, problem, condensed) if config.costs else None
+    return condensed._replace(own=own)
 
 
 def input_weights(weights: Weights) -> Float[Array, " u"]:
@@ -229,7 +232,7 @@ def half_slope(
 ) -> Float[Array, "N b"]:
     """Return half of P v + q, without forming P. Source: Eq. 3."""
     robot, parameters, _, horizon, _ = problem
-    _, G, turn, push, angles, later, travel, free = condensed
+    _, G, turn, push, angles, later, travel, free, own = condensed
     Q, R = parameters.weights.Q, input_weights(parameters.weights)
     turned, pushed = (contract("kxb,kb->kx", change, v) for change in (turn, push))
     moved = State(
@@ -248,8 +251,8 @@ def half_slope(
     effort = contract("kui,ki->ku", G, v) - parameters.effort_reference * weight
     slope = contract("jxb,jx->jb", turn, torque) + contract("jxb,jx->jb", push, force)
     slope = slope + contract("kui,u,ku->ki", G, R, effort) + _no_foot(config, condensed) * v
-    if config.costs:
-        A, target, weight = own_costs(config, problem, condensed)
+    if own is not None:
+        A, target, weight = own
         slope += (A.T @ (weight * (A @ v.ravel() - target))).reshape(v.shape)
     return slope
 
@@ -263,7 +266,7 @@ def half_hessian(
     config: MpcConfig, problem: MpcProblem, condensed: Condensed
 ) -> Float[Array, "n n"]:
     """Return half of P. Source: Eq. 3."""
-    _, G, turn, push, angles, later, travel, _ = condensed
+    _, G, turn, push, angles, later, travel, _, own = condensed
     N, b = config.horizon, G.shape[-1]
     weights = problem.parameters.weights
     Q, R = weights.Q, input_weights(weights)
@@ -276,8 +279,8 @@ def half_hessian(
     pushing = overlap[..., None] * Q.velocity + (travel.T @ travel)[..., None] * Q.position
     pushed = contract("ixa,ixjb->iajb", push, contract("ijx,jxb->ixjb", pushing, push))
     P = spin.T @ (turning @ spin) + pushed.reshape(N * b, N * b) + block_diagonal(effort)
-    if config.costs:
-        A, _, weight = own_costs(config, problem, condensed)
+    if own is not None:
+        A, _, weight = own
         P += A.T @ (weight[:, None] * A)
     return P
 
@@ -308,7 +311,7 @@ def _on_states(
     problem: MpcProblem, condensed: Condensed, parts: Sequence[Any]
 ) -> tuple[Array, ...]:
     """Return dense rows (rows, n) of parts on states, their constants, and their numbers."""
-    _, _, turn, push, angles, later, travel, free = condensed
+    _, _, turn, push, angles, later, travel, free, _ = condensed
     later, travel = later[:, None, :, None], travel[:, None, :, None]
     turn_, push_ = (jnp.swapaxes(part, 0, 1) for part in (turn, push))  # (3, N, b)
     poses = [jnp.einsum("kjxy,jyb->kxjb", angles, turn), travel * push_]

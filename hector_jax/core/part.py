@@ -1,7 +1,7 @@
 """Config entries that are functions: a file stores the name, the program calls the functions.
 
-A kind of part is a subclass that annotates its functions and lists, as `known`, the parts that a
-file can name; a part is an instance of it:
+A kind of part is a subclass that annotates its functions; a part is an instance of it. `known` are
+those that can be given by name, in files and in Python:
 
     class Solver(Part):
         approach: Callable[[Normal], Approach]
@@ -24,7 +24,7 @@ P = TypeVar("P", bound="Part")
 class Part:
     """A named value of a config that cannot be changed, mostly of pure functions."""
 
-    known: ClassVar[tuple[Any, ...]]
+    known: ClassVar[tuple[Any, ...]] = ()
 
     def __init__(self, name: str, **functions: Any) -> None:
         """Create a part with this name and these functions."""

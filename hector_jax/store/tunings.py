@@ -71,7 +71,7 @@ def artefact(setup: Setup, start: Weights) -> dict[str, Any]:
     return {"like": lambda _: like, "kind": "tuning", "robot": setup.robot}
 
 
-def _scenarios(config: TuneConfig, robot: Robot, problem: Problem) -> list[Scenario]:
+def rollouts_of(config: TuneConfig, robot: Robot, problem: Problem) -> list[Scenario]:
     """Return the rollouts of a problem.
 
     A drawn one starts at the touchdown of a foot or half a cycle later, and its net is one member.
@@ -141,7 +141,7 @@ def _objective(setup: Setup, start: Weights, problem: Problem) -> Objective:
         host = jax.tree.map(np.asarray, weights)
         return [f.result() for f in [pool.submit(job, config, s, host) for s in scenarios]]
 
-    scenarios, losses = _scenarios(config, robot, problem), np.ones(1)
+    scenarios, losses = rollouts_of(config, robot, problem), np.ones(1)
     if len(scenarios) > 1:
         found = of_all(_evaluation_job, scenarios, start)
         scenarios, losses = _usable(config, problem, scenarios, found)
@@ -160,7 +160,7 @@ def _tune_on_cpu(
 def _tune_on_gpu(setup: Setup, start: Weights, problem: Problem) -> Tuning:
     """Run one tuning on the accelerator, as a batch of one."""
     _, config, robot, _ = setup
-    models, losses = _scenarios(config, robot, problem), np.ones(1)
+    models, losses = rollouts_of(config, robot, problem), np.ones(1)
     if len(models) > 1:
         at = difftune.init(config, start).start
         found = [_evaluation_job(config, model, at) for model in models]
@@ -283,7 +283,7 @@ def tune_all(
 def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:
     results = [
         evaluate.gradient_norms(config.rollout, scenario, nominal(robot), config.loss)
-        for scenario in _scenarios(config, robot, problem)
+        for scenario in rollouts_of(config, robot, problem)
     ]
     return jax.tree.map(lambda *x: float(np.mean(x)), *results)
 
@@ -327,7 +327,7 @@ def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
 
 def _prepare_tuning(config: TuneConfig, robot: Robot, start: Weights, problem: Problem) -> None:
     """Compile the programs of a tuning, so that its first call need not."""
-    scenario, *_ = _scenarios(config, robot, problem)
+    scenario, *_ = rollouts_of(config, robot, problem)
     weights = difftune.init(config, start).start
     evaluation = _evaluation_job(config, scenario, weights)
     if not problem.draws:
