@@ -60,7 +60,7 @@ METHODS = {  # of the race, by plain names, with their lines
         "Bayesian optimisation (TuRBO with our model)",
         {"color": "#e07c24", "linestyle": (0, (5, 1.5))},
     ),
-    "nominal lq-cma-es": ("CMA-ES (lq)", {"color": "#7a3e9d", "linestyle": (0, (1.2, 1.2))}),
+    "nominal lq-cma-es": ("lq-CMA-ES", {"color": "#7a3e9d", "linestyle": (0, (1.2, 1.2))}),
 }
 
 
