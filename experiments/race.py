@@ -66,10 +66,8 @@ WALKS = "walks"
 OURS: dict[str, dict[str, Any]] = {
     WALKS: {},
     "no metric": {},
-    "no grounding": {"grounded": False},
-    "no surrogate": {"methods": ("model", "evolution")},
-    "no evolution": {"methods": ("model", "surrogate")},
-    "no gradients": {"methods": ("surrogate", "evolution")},
+    "no grounding": {"model": "plain"},
+    "no gradients": {"model": "none"},
 }
 """The method of `hector tune --walks`, and what is left out of it."""
 METRIC = " in metric"

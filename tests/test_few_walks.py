@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from hector_jax.search.few_walks import (
-    METHODS,
     Model,
     WalkResult,
     incumbent,
@@ -49,10 +48,10 @@ def walked(proposal, loss, margin=0.1):
     return WalkResult(*proposal, loss=loss, margin=margin)
 
 
-def tune(walks, truth=lambda point: bowl(GOAL, point)[0], margin=lambda point: 0.1, **options):
+def tune(walks, truth=lambda point: bowl(GOAL, point)[0], margin=lambda point: 0.1, by=model):
     history = []
     for _ in range(walks):
-        proposal = propose(SPACE, history, model, **options)
+        proposal = propose(SPACE, history, by)
         history.append(walked(proposal, truth(proposal.point), margin(proposal.point)))
     return history
 
@@ -70,22 +69,19 @@ def test_the_metric_makes_the_loss_round_and_leaves_unknown_numbers_alone():
     np.testing.assert_allclose(SPACE.to_steps[4], np.eye(SIZE)[4])
 
 
-def test_the_model_leads_first_then_the_surrogate_and_each_fourth_walk_evolution(history):
+def test_the_model_leads_first_then_the_surrogate(history):
     methods = [row.method for row in history]
     turn = methods.index("surrogate")
     assert methods[0] == "start"
     assert 2 <= turn - 1 <= 6
     assert set(methods[1:turn]) == {"model"}
-    evolved = [i for i, method in enumerate(methods) if method == "evolution"]
-    assert len(evolved) >= 3
-    assert set(np.diff(evolved)) == {4}
-    assert [needs_model(history[:i]) for i in (1, evolved[0])] == [True, False]
+    assert set(methods[turn:]) == {"surrogate"}
+    assert [needs_model(history[:i]) for i in (1, turn + 1)] == [True, False]
 
 
-@pytest.mark.parametrize("absent", METHODS)
-def test_a_method_that_may_not_propose_does_not(absent):
-    rows = tune(12, methods=[name for name in METHODS if name != absent])
-    assert {row.method for row in rows} == {"start", *METHODS} - {absent}
+def test_without_a_model_the_surrogate_proposes_alone():
+    rows = tune(12, by=None)
+    assert {row.method for row in rows} == {"start", "surrogate"}
     assert min(row.loss for row in rows) < rows[0].loss
 
 

@@ -89,7 +89,7 @@ def test_eight_walks_through_files_equal_eight_in_process_to_the_last_bit(
         np.testing.assert_array_equal(mine.point, theirs.point)
         np.testing.assert_array_equal(mine.losses, theirs.losses)
         assert (mine.method, mine.predicted) == (theirs.method, theirs.predicted)
-    assert {row.method for row in rows} == {"start", "model", "surrogate", "evolution"}
+    assert {row.method for row in rows} == {"start", "model", "surrogate"}
     assert min(row.losses[0] for row in rows) < 0.9 * rows[0].losses[0]
 
 
@@ -121,10 +121,8 @@ def test_any_engine_walks_and_is_recorded(robot, in_process, tmp_path):
 def test_the_plain_model_is_not_grounded(robot, pool, in_process):
     one, _, rows = in_process
     losses = [
-        walks._model(
-            pool, replace(one, grounded=grounded), walks.campaign_space(pool, one), rows[:1]
-        )
-        for grounded in (True, False)
+        walks._model(pool, replace(one, model=model), walks.campaign_space(pool, one), rows[:1])
+        for model in ("grounded", "plain")
     ]
     point = rows[1].point
     assert losses[0].evaluate(rows[0].point)[0] == pytest.approx(1.0)

@@ -2,7 +2,7 @@
 
 Points are steps of the log-weights in the metric of the model: its Gauss-Newton matrix is near the
 identity there, so that no walk is needed to learn which directions matter. A point comes from one
-of three methods:
+of two methods:
 
 - `model`: the least loss, in a trust region about the best walk, of the rigid-body model grounded
   on that walk (tuning/grounded.py), until two walks in a row gain less than 1 %. If its point was
@@ -10,7 +10,6 @@ of three methods:
 - `surrogate`: the largest expected improvement, in the trust region, by a Gaussian process on the
   log-losses of all walks, times the probability of a margin against falls. It learns what the model
   does not contain.
-- `evolution`: a sample of CMA-ES, every fourth walk from then on, in case both are wrong.
 
 The trust region grows if a walk gains what was predicted, and shrinks if it does not (ratio test:
 Conn, Gould, Toint, "Trust region methods", 2000). A proposal is a function of the history alone.
@@ -36,12 +35,9 @@ from hector_jax.tuning.step_rules import StepState
 # added to the eigenvalues of the metric: a flat direction has a unit step of two e-folds
 _FLAT = 0.25
 _FIRST, _LEAST, _MOST = 1.0, 0.3, 4.0  # radius of the trust region
-METHODS = ("model", "surrogate", "evolution")
-"""Methods that propose points, see the module's docstring."""
 GAIN = 0.01
 """Smallest significant gain in log-loss."""
 _STALLED = 2  # walks of the model in a row without such a gain before the surrogate takes over
-_EVERY, _POPULATION, _SPREAD = 4, 8, 0.3  # CMA-ES: period [walks], population, first deviation
 _STEPS = 2  # on the model for a proposal
 _SAME = 0.02  # the model's point counts as walked within this distance of a walk
 _STARTS, _SQP = 6, 40  # of the maximisation of the expected improvement: starts, iterations
@@ -147,9 +143,9 @@ def incumbent(space: Space, history: Sequence[WalkResult]) -> int:
     return _fit_losses(space, history)[1]
 
 
-def needs_model(history: Sequence[WalkResult], methods: Sequence[str] = METHODS) -> bool:
-    """Return True if the next proposal needs the model, grounded on the walk `best_walk`."""
-    return bool(history) and "model" in methods and _region(history).stalled_at is None
+def needs_model(history: Sequence[WalkResult]) -> bool:
+    """Return True if the next proposal may use the model, grounded on the walk `best_walk`."""
+    return bool(history) and _region(history).stalled_at is None
 
 
 def best_walk(history: Sequence[WalkResult]) -> int:
@@ -162,17 +158,14 @@ def propose(
     history: Sequence[WalkResult],
     model: Model | None = None,
     seed: int = 0,
-    *,
-    methods: Sequence[str] = METHODS,
 ) -> Proposal:
     """Propose the point to walk next.
 
     Args:
         space: coordinates.
         history: walks so far, the start first.
-        model: grounded on the best walk; only used if `needs_model`.
+        model: grounded on the best walk; only used if `needs_model`. None: the surrogate proposes.
         seed: of the draws.
-        methods: those of METHODS that may propose; "surrogate" or "evolution" is among them.
 
     Raises:
         InputError: the packages of the extra `search` are not installed.
@@ -180,18 +173,12 @@ def propose(
     if not history:
         return Proposal(np.zeros(len(space.box)), "start", None)
     region = _region(history)
-    since = len(history) if region.stalled_at is None else region.stalled_at
-    if needs_model(history, methods):
-        if model is None:
-            raise ValueError("the next proposal needs the model")
+    if model is not None and needs_model(history):
         center = history[region.center].point
         point, predicted = _descend_in(space, center, region.radius, model)
         if min(np.linalg.norm(point - row.point) for row in history) > _SAME:
             return Proposal(point, "model", float(predicted))
         region = region._replace(radius=_FIRST)
-    hedges = "evolution" in methods and (len(history) - since) % _EVERY == _EVERY - 1
-    if hedges or "surrogate" not in methods:
-        return Proposal(space.clip(_evolution(history, since, seed)), "evolution", None)
     return _improve(space, history, region.radius, np.random.default_rng([seed, len(history)]))
 
 
@@ -363,25 +350,3 @@ def _improve(
     point = space.clip(min(minima, key=itemgetter(1))[0])
     mean, _ = _posterior(losses, jnp.asarray(point))
     return Proposal(point, "surrogate", float(mean))
-
-
-# The evolution strategy
-
-
-def _evolution(history: Sequence[WalkResult], since: int, seed: int) -> Float[np.ndarray, " n"]:
-    """Draw the next sample of CMA-ES, updated with all walks since the model stalled."""
-    require_package("cmaes", "search", "tuning on walks")
-    from cmaes import CMA
-
-    first = history[best_walk(history[:since])]
-    evolution = CMA(first.point, _SPREAD, seed=seed, population_size=_POPULATION)
-    worst = max(row.loss for row in history if np.isfinite(row.loss))
-    generation: list[tuple[Any, float]] = []
-    for row in history[since:]:
-        if row.method == "evolution":
-            evolution.ask()  # repeats the draw of that walk
-        generation.append((row.point, row.loss if np.isfinite(row.loss) else worst + 1.0))
-        if len(generation) == _POPULATION:
-            evolution.tell(generation)
-            generation = []
-    return evolution.ask()

@@ -21,7 +21,7 @@ from hector_jax.control.weights import Weights, direction_names
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.model import Robot
 from hector_jax.search.cmaes import checked_bounds
-from hector_jax.search.few_walks import METHODS, Space
+from hector_jax.search.few_walks import Space
 from hector_jax.sim.engine import MUJOCO_C, Engine
 from hector_jax.sim.world import Imperfections
 from hector_jax.tuning.difftune import TuneConfig, init
@@ -40,8 +40,8 @@ class Campaign:
     seed: int = 0
     leg_numbers: tuple[str, ...] = ()  # of the legs, which the model does not have
     engine: Engine = MUJOCO_C
-    methods: tuple[str, ...] = METHODS  # that propose
-    grounded: bool = True  # the model is corrected by the residuals of the best walk
+    # that proposes: "grounded", corrected by the residuals of the best walk, "plain", or "none"
+    model: str = "grounded"
 
     def __post_init__(self) -> None:
         start = jax.tree.map(np.asarray, init(self.config, self.start).start)

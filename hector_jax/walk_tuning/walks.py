@@ -99,7 +99,7 @@ def _ground_job(campaign: Campaign, weights: Weights, command: Command, log: Log
     trajectory = trajectory_of(log, config.walk.gait.tick)
     scenario = Scenario(robot, command, standing_anchor(robot), effect)
     grounding = fit_grounding(config, scenario, weights, trajectory)
-    if not campaign.grounded:
+    if campaign.model == "plain":
         grounding = grounding._replace(residuals=jax.tree.map(jnp.zeros_like, grounding.residuals))
     return jax.device_get(grounding)
 
@@ -164,8 +164,11 @@ def read_history(campaign: Campaign) -> list[Row]:
         head |= {"robot": walker_hash(campaign.robot), "settings": settings}
         hint = f" and begin anew with hector propose --start {campaign.folder}/weights/N.json"
     else:
-        head |= {"methods": list(campaign.methods), "grounded": campaign.grounded}
-        head |= {"engine": engine.key, "code": code_hash("walk_tuning.walks", *engine.modules)}
+        head |= {
+            "model": campaign.model,
+            "engine": engine.key,
+            "code": code_hash("walk_tuning.walks", *engine.modules),
+        }
 
     def parse(row: Mapping[str, Any]) -> Row:
         point, losses = np.array(row["point"], float), np.array(row["losses"], float)
@@ -205,9 +208,9 @@ def next_proposal(
     if (proposal := pending(campaign, len(rows))) is not None:
         return proposal, weights_at(campaign, space, proposal.point)
     history = _walked(rows)
-    has_model = few_walks.needs_model(history, campaign.methods)
+    has_model = campaign.model != "none" and few_walks.needs_model(history)
     model = _model(pool, campaign, space, rows) if has_model else None
-    proposal = few_walks.propose(space, history, model, campaign.seed, methods=campaign.methods)
+    proposal = few_walks.propose(space, history, model, campaign.seed)
     weights = weights_at(campaign, space, proposal.point)
     save_weights(weights_path(campaign.folder, len(rows)), weights)
     fields = {**proposal._asdict(), "point": proposal.point.tolist()}
