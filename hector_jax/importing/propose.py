@@ -78,7 +78,6 @@ def propose_robot(path: Path) -> RobotProposal:
     Raises:
         InputError: one line with the wrong part of the TOML file.
     """
-    path = Path(path)
     own: dict[str, Any] = {"model": path.name}
     if path.suffix == ".toml":
         own = read_toml(path, "the robot description", MAX_BYTES)
@@ -244,8 +243,7 @@ def _armature(description: Description) -> list[float] | None:
     count = description.leg_joints
     armature = model.dof_armature[6 : 6 + count]
     default = _ARMATURE_PER_LIMIT * model.actuator_ctrlrange[:count, 1]
-    complete = np.all(armature)
-    return None if complete else [_short(x) for x in np.where(armature, armature, default)]
+    return None if armature.all() else [_short(x) for x in np.where(armature, armature, default)]
 
 
 def _gains(robot: Robot, answer: Response) -> dict[str, list[float]]:

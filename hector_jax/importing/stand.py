@@ -23,7 +23,7 @@ from hector_jax.robot.links import data_at
 
 KNEE = 1.0  # [rad] of the first trial
 _NEARLY_STRAIGHT = 0.1  # [rad] of a knee at zero: offsets of a design, which are no bend
-_NEXT_BEND = 0.85  # of the last trial's
+_NEXT_BEND = 0.85  # of that of the trial before
 _TRIALS = 9
 _MARGIN = 0.03  # [rad] from the limits
 _ANGLE_WEIGHT = 1e-3  # in the least-squares problem
@@ -41,13 +41,12 @@ def standing_pose(
         soles: of its feet.
         pose: angles [rad] by joint passed to `find_soles`; None for all joints at zero.
     """
-    bend, joints = KNEE, sum(survey.legs, ())
+    joints = sum(survey.legs, ())
     angles, solved = np.zeros(len(joints)), False
-    for _ in range(_TRIALS):
-        angles, solved = _solve(survey, soles, bend, pose)
+    for trial in range(_TRIALS):
+        angles, solved = _solve(survey, soles, KNEE * _NEXT_BEND**trial, pose)
         if solved:
             break
-        bend *= _NEXT_BEND
     rounded = {
         survey.model.joint(j).name: round(float(q), _DIGITS)
         for j, q in zip(joints, angles, strict=True)

@@ -56,7 +56,6 @@ def survey_file(path: Path, named: Sequence[Sequence[str]] = ()) -> Survey:
     Raises:
         InputError: one line with the missing part and the remedy.
     """
-    path = Path(path)
     root = read_mjcf(path)
     spec, _ = spec_of(path, root, (), None)
     model = compile_bare(path, root, spec)
@@ -132,17 +131,16 @@ def _legs(path: Path, data: mujoco.MjData, free: Sequence[int]) -> tuple[tuple[i
                 pairs.append((round(lowest, 3), -len(a), a, b))  # to the millimetre
             turned = _offsets(data, a, b, ahead=1).max() <= _MIRROR_TOLERANCE
             worst = int(np.argmax(offset))
-            apart.append((not turned, offset[worst], model.joint(a[worst]), model.joint(b[worst])))
+            names = tuple(model.joint(leg[worst]).name for leg in (a, b))
+            apart.append((not turned, offset[worst], names))
     ends = ", ".join(f"{model.joint(chain[-1]).name} ({len(chain)})" for chain in chains)
     text = f"no two legs found, expected two chains of {FEWEST_JOINTS} to {MOST_JOINTS} hinges "
     text += f"that mirror each other; chains by their last joint: {ends or 'none'}"
     odd = np.flatnonzero((model.jnt_type != _HINGE) & (model.jnt_type != _FREE))
     text += f"; no hinges: {', '.join(model.joint(j).name for j in odd)}" * bool(len(odd))
     if apart:
-        not_turned, offset, one, other = min(apart, key=lambda pair: pair[:2])
-        text += (
-            f"; the lines of {one.name} and {other.name} are {100 * offset:.1f} cm from mirrored"
-        )
+        not_turned, offset, (one, other) = min(apart, key=lambda pair: pair[:2])
+        text += f"; the lines of {one} and {other} are {100 * offset:.1f} cm from mirrored"
         if not not_turned:
             text = "the legs mirror each other in x, so the robot looks along y, expected along x: "
             text += "put its trunk into a body of its own, which has the free joint, turned in it "

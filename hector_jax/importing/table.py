@@ -48,8 +48,8 @@ def table_of(robot: Robot) -> list[str]:
 
 def changes_of_model(robot: Robot) -> list[str]:
     """Return one line per change that was made to the model of the robot's file."""
-    notes = build_spec(robot.description).notes
-    return [note for note in notes if not note.startswith("fixed: ")]  # the table lists these
+    # the table lists what is fixed
+    return [x for x in build_spec(robot.description).notes if not x.startswith("fixed: ")]
 
 
 def _knees_ahead(robot: Robot, model: mujoco.MjModel) -> list[bool]:
