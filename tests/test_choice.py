@@ -1,4 +1,4 @@
-"""Which point of the path of a tuning is the set `best` of a run."""
+"""The set `best` of a run: its settings, and which point of the path of its tuning it is."""
 
 from concurrent.futures import Executor
 from types import SimpleNamespace
@@ -6,69 +6,56 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-from model import CONFIG, ROBOT
-from pretend import instead, tuning_of
+from model import BEST_OTHERS, CONFIG, ROBOT
+from pretend import instead, pretend_score, pretend_tuning
 
+from hector_jax.cli import run_folder
+from hector_jax.cli.flags import Tune
+from hector_jax.control.parameters import GROUPS
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import nominal
+from hector_jax.core.inputs import InputError
 from hector_jax.store.setup import Setup
-from hector_jax.tuning.difftune import Iteration
-from hector_jax.tuning.evaluate import Evaluation
-from hector_jax.tuning.status import StepStatus
+from hector_jax.tuning.loss import alphas
 from hector_jax.verdict import choice, judging
-from hector_jax.verdict.metrics import score_like
-
-SETUP = Setup(Executor(), CONFIG, ROBOT)
-
-
-def _tuning(count):
-    """A tuning that accepted every second iteration; the weights tell how many came before."""
-    seen = Evaluation(np.zeros(()), {}, nominal(), np.zeros(()), np.zeros(()))
-
-    def iteration(i):
-        weights = jax.tree.map(lambda w: w * (1.0 + i // 2), nominal())
-        status = StepStatus.NO_GAIN if i % 2 else StepStatus.ACCEPTED
-        return Iteration(np.asarray(i), weights, seen, np.asarray(status), np.ones(()))
-
-    history = [iteration(i) for i in range(2 * count - 1)]
-    return tuning_of(history)
 
 
 def test_start_quarter_half_and_end_of_the_accepted_path_walk():
-    points = choice.points_of(_tuning(9))
+    points = choice.points_of(pretend_tuning(16, refused=range(1, 16, 2)))
     assert list(points) == ["iteration 0", "iteration 4", "iteration 8", "iteration 16"]
-    scale = points["iteration 8"].Q.euler / nominal().Q.euler
-    np.testing.assert_array_equal(scale, np.full(3, 5.0))
-    assert list(choice.points_of(_tuning(1))) == ["iteration 0"]
-
-
-def _walk(monkeypatch, median):
-    """Let sets walk with these losses on even plants, in reverse order on odd ones."""
-
-    def judge(setup, sets, command, plants, seeds, **notes):
-        assert "drawn around the hfs" in notes["title"]
-        tuned_on = choice.drawn_plants(ROBOT, 1000)  # the most of --walk-plants
-        assert not {float(plant.mass) for plant in plants} & {float(p.mass) for p in tuned_on}
-        scale, score = (1.0, 100.0)[command is not STRAIGHT], score_like(loss=CONFIG.loss)
-        costs = {name: [scale * x * (0.9, 1.1)[i % 2] for i in seeds] for name, x in median.items()}
-        return SimpleNamespace(
-            scores={
-                name: [score._replace(losses={"L": np.array(L)}) for L in costs[name]]
-                for name in sets
-            }
-        )
-
-    instead(monkeypatch, judging, "judge", judge)
-
-
-STRAIGHT = named_command("straight")
+    assert list(choice.points_of(pretend_tuning(0))) == ["iteration 0"]
 
 
 @pytest.mark.parametrize("winner", ["set 0", "set 2"])
 def test_the_set_that_walks_best_on_drawn_plants_is_taken(monkeypatch, capsys, winner):
+    def judge(setup, sets, command, plants, seeds, **notes):
+        tuned_on = choice.drawn_plants(ROBOT, 1000)  # the most of --walk-plants
+        assert not {float(plant.mass) for plant in plants} & {float(p.mass) for p in tuned_on}
+        scale = 1.0 if command is straight else 100.0
+        scores = {name: [pretend_score(scale * losses[name])] * len(plants) for name in sets}
+        return SimpleNamespace(scores=scores)
+
+    instead(monkeypatch, judging, "judge", judge)
     losses = {"set 0": 1.0, "set 1": 0.9, "set 2": 1.1, "set 3": 2.0, winner: 0.5}
-    _walk(monkeypatch, losses)
-    sets, commands = dict.fromkeys(losses, nominal()), (STRAIGHT, named_command("c"))
-    assert choice.walks_best(SETUP, sets, commands, 3, seconds=4.0, folder=None) == winner
+    setup, sets = Setup(Executor(), CONFIG, ROBOT), dict.fromkeys(losses, nominal())
+    straight, turning = map(named_command, ("straight", "c"))
+    best = choice.walks_best(setup, sets, (straight, turning), 3, seconds=4.0, folder=None)
+    assert best == winner
     said = capsys.readouterr().err
     assert f"best: {winner} of set 0 to set 3 walks best on 3 plants drawn around the hfs" in said
+
+
+def test_best_is_tuned_with_numbers_of_its_own_and_smoothly_where_asked():
+    start = nominal()._replace(others={"footstep_width": np.array(0.09)})
+    config, at = choice.settings_of_best(CONFIG, ROBOT, start, smooth=3.0, safe=0.05)
+    assert at.others == {**BEST_OTHERS, "position_limit": 0.05, "footstep_width": 0.09}
+    before = alphas(CONFIG.loss)
+    assert alphas(config.loss) == {**before, "L_between": 3.0 * before["L_ctrl"]}
+    assert config.others == GROUPS["integral"]
+    assert config.rollout == CONFIG.rollout
+    jax.tree.map(np.testing.assert_array_equal, at[:2], start[:2])
+
+
+def test_a_limit_of_the_position_error_is_set_once():
+    with pytest.raises(InputError, match="--safe sets the position limit, which --start has"):
+        run_folder.trajectories(Tune(safe=0.05, start="best"), ROBOT)

@@ -3,46 +3,31 @@
 import json
 import re
 import sys
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
+import jax
 import numpy as np
 import pytest
 from pretend import instead, pretend_walk
 
-from hector_jax.cli import arguments, evaluate
-from hector_jax.cli import tune as tuning
 from hector_jax.cli.main import main
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
-from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import nominal
-from hector_jax.core.inputs import InputError
+from hector_jax.control.weights_file import save_weights
 from hector_jax.robot.model import load_robot
 from hector_jax.sim import diagnosis
-from hector_jax.sim.diagnosis import Fall, Record, likeliest_cause, not_the_weights
+from hector_jax.sim.diagnosis import Record, fall_of, likeliest_cause, not_the_weights
 from hector_jax.sim.loop import Job
-from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
-from hector_jax.store import tunings
-from hector_jax.store.setup import Setup
-from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.evaluate import Evaluation
-from hector_jax.verdict import judging, metrics
 
-ROBOT, STRAIGHT = load_robot(), named_command("straight")
-JOB = Job(nominal(), STRAIGHT, hfs(), 1.0)
+CONFIG, ROBOT = WalkConfig(), load_robot()
+JOB = Job(nominal(), named_command("straight"), hfs(), 1.0)
 STANDING = float(ROBOT.standing_height)
-FALL = Fall(-0.42, 0.21, 0.93, "it tips over forwards (standing pose, joint gains, gait)")
-TEXT = (
-    "fell at -0.42 s, in the start-up: centre of mass 0.21 m high, tilt 0.93 rad; likeliest cause: "
-    "it tips over forwards (standing pose, joint gains, gait)"
-)
 
 
-def fallen_at_once(seed=0, seconds=1.0):
-    walked = pretend_walk(seed, seconds=seconds)
+def fallen_at_once():
+    walked = pretend_walk(seconds=1.0)
     return walked._replace(fallen=np.ones_like(walked.fallen))
 
 
@@ -68,16 +53,14 @@ def recorded(
     )
 
 
-def unsolved():
-    walked = fallen_at_once()
-    return walked._replace(residual=np.full_like(walked.residual, np.inf))
+UNSOLVED = fallen_at_once()._replace(residual=np.full(100, np.inf))
 
 
 @pytest.mark.parametrize(
     ("record", "cause"),
     [
         (recorded(height=np.nan), "the physics diverges"),
-        (recorded(-0.2, walked=unsolved()), "a QP of the MPC is not solved"),
+        (recorded(-0.2, walked=UNSOLVED), "a QP of the MPC is not solved"),
         (recorded(-0.2, knee=1.0), "the torque of left_knee is at its limit of 67 N m for 100 %"),
         (recorded(-0.2, sole=(0.0, 0.3)), "the right foot stands on an edge of its sole"),
         (recorded(-0.2, friction=(0.0, 0.99)), "the right foot slips, at the limit of the floor's"),
@@ -87,6 +70,7 @@ def unsolved():
         (recorded(-0.2), "the centre of mass sinks steadily, by 9 cm while still upright"),
         (recorded(0.2, (0.0, 0.3)), "the centre of mass rises steadily, by 20 cm"),
         (recorded(0.06, (0.0, 0.9)), "it tips over forwards"),
+        (recorded(0.0, (0.0, 0.9), np.linspace(0.0, 0.9, 1000) > 0.5), "it tips over"),
         (recorded(0.0, (0.9, 0.1)), "it tips over to the right"),
         (recorded(0.0, (0.0, 0.3), touching="left_shin"), "left_shin touches the floor"),
     ],
@@ -97,135 +81,73 @@ def test_the_likeliest_cause_follows_from_what_came_before_the_fall(record, caus
 
 def test_a_fall_in_the_start_up_is_that_of_the_walk():
     heavy = JOB._replace(imperfections=hfs()._replace(mass=np.array(6.0)), seconds=0.05)
-    config, rows = WalkConfig(), []
-    walked = walk(
-        config,
-        ROBOT,
-        heavy,
-        build=partial(MujocoPlant, on_step=lambda world, data: rows.append(data.qpos[2])),
-    )
+    walked, fall = walk(CONFIG, ROBOT, heavy), fall_of(CONFIG, ROBOT, heavy)
     assert walked.fallen.all()
-    fall = diagnosis.fall_of(config, ROBOT, heavy)
-    assert fall is not None
     assert -1.1 < fall.time < -0.5
-    # the walk goes on to the end of the ten ticks in which it falls
-    assert 0.0 <= len(rows) - 1000 * (fall.time + 1.1) < 100
     assert fall.height == pytest.approx(float(walked.initial.position[2]), abs=5e-3)
     assert fall.height < ROBOT.description.min_height
     assert "sinks steadily" in fall.cause
-    assert diagnosis.fall_of(config, ROBOT, JOB._replace(seconds=0.05)) is None
+    assert fall_of(CONFIG, ROBOT, JOB._replace(seconds=0.05)) is None
 
 
 def test_a_fall_of_a_walk_has_the_cause_of_its_plant():
-    icy, config = hfs()._replace(floor_friction=np.array(0.22)), WalkConfig()
+    icy = hfs()._replace(floor_friction=np.array(0.22))
     job = JOB._replace(command=named_command("s"), imperfections=icy, seconds=2.0)
-    walked = walk(config, ROBOT, job)
-    fall = diagnosis.fall_of(config, ROBOT, job)
-    assert fall is not None
+    fall = fall_of(CONFIG, ROBOT, job)
     assert fall.time > 0.0
-    assert fall.time == pytest.approx(0.001 * np.sum(~walked.fallen))
+    assert fall.time == pytest.approx(0.001 * np.sum(~walk(CONFIG, ROBOT, job).fallen))
     assert "foot slips" in fall.cause
     assert str(fall).startswith(f"fell after {fall.time:.2f} s: ")
 
 
-# What no weights mend
-
-
-def settled(height):
-    """Two seconds upright, this far above the reference [m]."""
-    walked = pretend_walk(error=0.0, seconds=2.0)
-    position = walked.reference.position + [0.0, 0.0, height]
-    return walked._replace(state=walked.state._replace(position=position))
-
-
-def lines(monkeypatch, record):
-    monkeypatch.setattr(
-        diagnosis, "record_walk", lambda *args: record._replace(time=record.time + 2.0)
-    )
-    return not_the_weights(WalkConfig(), ROBOT, JOB)
-
-
-def test_a_sound_walk_has_nothing_to_be_told(monkeypatch):
-    assert lines(monkeypatch, recorded(fallen=False, walked=settled(0.015))) == []
-
-
 def test_a_height_that_is_off_and_motors_at_their_limits_are_told(monkeypatch):
-    record = recorded(fallen=False, walked=settled(-0.04))
-    record.torque[:100, 2], record.torque[:30, 5] = -0.99, 1.0
-    height, torque = lines(monkeypatch, record)
+    def lines(height, **shares):
+        walked = pretend_walk(error=0.0, seconds=2.0)
+        walked.state.position[:, 2] = walked.reference.position[:, 2] + height
+        record = recorded(fallen=False, walked=walked)
+        record.torque[:100, 2], record.torque[:30, 5] = shares.get("at_limit", 0.0), 1.0
+        record = record._replace(time=record.time + 2.0)
+        instead(monkeypatch, diagnosis, "record_walk", lambda *args: record)
+        return not_the_weights(CONFIG, ROBOT, JOB)
+
+    assert lines(0.015) == []
+    height, torque = lines(-0.04, at_limit=-0.99)
     assert height.startswith("the centre of mass is 4.0 cm below its reference all along")
     text = "the torque of left_hip_pitch is at its limit of 33.5 N m for 10 % of the time"
     assert torque.startswith(f"{text} (try a slower trajectory")
 
 
-def test_a_start_that_falls_is_refused_before_anything_is_collected(monkeypatch, tmp_path):
-    made = []
-
-    def walks_of(setup, jobs, title, engine):
-        made.extend(jobs)
-        yield from (pretend_walk(fall_at=0.5 if job.command is S else None) for job in jobs)
-
-    instead(monkeypatch, judging, "walk_jobs", walks_of)
-    instead(monkeypatch, tuning, "fall_of", lambda *args: FALL)
-    both = [NamedCommand(name, named_command(name)) for name in ("straight", "s")]
-    S = both[1].command
-    with ThreadPoolExecutor(1) as pool:
-        setup = Setup(pool, TuneConfig(), ROBOT)
-        line = re.escape(
-            f"--start nominal cannot be tuned from: s on the high-fidelity simulator {TEXT}"
-        )
-        with pytest.raises(InputError, match=line):
-            tuning._check_start(setup, "nominal", nominal(), both, tmp_path)
-        assert len(made) == 2
-        # a run walks its sets there later, and reads the walk of the start
-        inputs = setup, {"nominal": nominal()}, both[0].command, [hfs()], [0]
-        judging.judge(*inputs, title="", folder=tmp_path)
-    assert len(made) == 2
+@pytest.fixture
+def weak(tmp_path, monkeypatch):
+    """A file of weights that are too shy of forces to stand."""
+    monkeypatch.chdir(tmp_path)
+    shy = nominal()._replace(R=jax.tree.map(lambda x: 1e6 * x, nominal().R))
+    save_weights(tmp_path / "weak.json", shy)
+    return tmp_path
 
 
-# How a fall in the start-up is told
+@pytest.mark.slow
+def test_a_start_that_falls_is_refused_before_anything_is_collected(monkeypatch, weak, capsys):
+    flags = ["--start", "weak.json", "--seeds", "1", "--no-video", "--processes", "1"]
+    monkeypatch.setattr(sys, "argv", ["hector", "tune", "--traj", "straight", *flags])
+    assert main() == 2
+    line = "--start weak.json cannot be tuned from: straight on the high-fidelity simulator fell at"
+    assert line in capsys.readouterr().err
+    assert not list(weak.glob("data/**/*.npz"))
 
 
-def test_hector_walk_tells_the_fall_and_prints_no_nan(monkeypatch, capsys):
-    instead(monkeypatch, arguments, "walk_once", lambda *args, **kwargs: fallen_at_once())
-    instead(monkeypatch, evaluate, "fall_of", lambda *args: FALL)
-    monkeypatch.setattr(sys, "argv", ["hector", "walk"])
+def test_hector_walk_tells_the_fall_and_prints_no_nan(monkeypatch, weak, capsys):
+    words = ["hector", "walk", "--weights", "weak.json", "--seconds", "0.1"]
+    monkeypatch.setattr(sys, "argv", words)
     assert main() == 0
     out = capsys.readouterr().out
-    assert out.startswith(f"straight in hfs, nominal weights: {TEXT}; L ")
+    assert re.search(
+        r": fell at -\d.\d+ s, in the start-up: centre of mass .*likeliest cause: ", out
+    )
     assert "nan" not in out
-    monkeypatch.setattr(sys, "argv", ["hector", "walk", "--json"])
+    monkeypatch.setattr(sys, "argv", [*words, "--json"])
     assert main() == 0
     told = json.loads(capsys.readouterr().out)
-    assert (told["seconds"], told["fell"]) == (-0.42, True)
-    assert told["fall"] == FALL._asdict()
+    assert told["fell"]
+    assert told["seconds"] == told["fall"]["time"] < 0.0
     assert told["rms_position"] == [None] * 3
-
-
-def test_torques_of_a_robot_that_is_half_over_are_nobodys_fault():
-    record = recorded(0.0, (0.0, 0.9))
-    record.torque[record.tilt > 0.5] = 1.0
-    assert "tips over" in likeliest_cause(ROBOT, record)
-
-
-def test_a_start_that_falls_on_the_model_is_refused_before_anything_is_collected(monkeypatch):
-    zero = np.zeros(())
-    fell = Evaluation(zero, {}, nominal(), fallen=np.ones(()), residual=zero)
-    monkeypatch.setattr(tunings.difftune, "tune_step", lambda *args, **model: fell)
-    problem = tunings.Problem((named_command("straight"),), None)
-    with pytest.raises(InputError, match="the robot fell .try a slower or shorter trajectory"):
-        tunings._prepare_tuning(TuneConfig(), ROBOT, nominal(), problem)
-
-
-def test_a_tuned_set_that_walks_worse_than_nominal_is_told(capsys):
-    def scored(L):
-        score = metrics.score_like()
-        score = score._replace(losses=score.losses | {"L": np.array(L)})
-        last = pretend_walk().initial
-        return [judging.ScoredWalk(score, np.array(4.0), last, "", "")]
-
-    walks = {"nominal": scored(2e6), "without": scored(3e6), "with": scored(1e6)}
-    tuning._say_worse("straight", judging.ScoredWalks(walks, {}))
-    said = capsys.readouterr().err
-    assert "straight: on the high-fidelity simulator `without` walks with L 3e6, nominal" in said
-    assert "`with`" not in said

@@ -1,40 +1,29 @@
 """Faults planted inside a tuning: refused, reported, and never in the weights."""
 
-import json
-import sys
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from enum import IntEnum
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from model import ROBOT, small_effect
 
-from hector_jax.cli.main import main
 from hector_jax.control.parameters import bounds
-from hector_jax.control.reference import Command
+from hector_jax.control.reference import Command, standing_anchor
 from hector_jax.control.weights import nominal, weights_to_vector
 from hector_jax.core.inputs import InputError
-from hector_jax.report.run import tuning_section
-from hector_jax.robot.model import load_robot
-from hector_jax.store import tunings
-from hector_jax.store.setup import Setup
-from hector_jax.store.tunings import Problem
-from hector_jax.tuning import rollout
+from hector_jax.tuning import difftune, rollout
 from hector_jax.tuning.difftune import TuneConfig, descend
 from hector_jax.tuning.evaluate import Evaluation, Objective
-from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.rollout import RolloutConfig, Scenario
 from hector_jax.tuning.status import Stop
-from tests.model import small_net
 
 pytestmark = pytest.mark.usefixtures("on_cpu")
-ROBOT = load_robot()
-TICKS, AT = 24, 9  # of the walk, of the fault
-CONFIG = TuneConfig(rollout=RolloutConfig(ticks=TICKS), iterations=14)
+AT = 9  # tick of the fault
+CONFIG = TuneConfig(rollout=RolloutConfig(ticks=24), iterations=14)
+EFFECT = small_effect()  # adds a newton or so to what was commanded
 
 
 class Fault(IntEnum):
@@ -84,8 +73,8 @@ step_carry = rollout.step_carry
 def planted(config, scenario, weights, carry, tick, *, wrench=None):
     """`step_carry` with the fault that the command names."""
     command = scenario.command
-    flat = [weights_to_vector(w) for w in (weights, nominal())]
-    far = jnp.max(jnp.abs(jnp.log(flat[0] / flat[1]))) > command.velocity[1, 1]
+    ratio = weights_to_vector(weights) / weights_to_vector(nominal())
+    far = jnp.max(jnp.abs(jnp.log(ratio))) > command.velocity[1, 1]
     now = far & (tick == command.velocity[1, 0])
     is_now = lambda fault: now & (command.yaw_rate[1] == fault)  # noqa: E731
     walked = command._replace(yaw_rate=jnp.zeros_like(command.yaw_rate))
@@ -108,125 +97,73 @@ def plant():
         yield
 
 
-@pytest.fixture(scope="module")
-def params():
-    """A small net that adds a newton or so to what was commanded."""
-    return small_net()
-
-
 RULES = {"gauss_newton": 8.0, "relative": 2.0}  # by how much a refusal shortens the step
 REACH = {"gauss_newton": 0.3, "relative": 0.03}  # a full step goes beyond it, some share does not
 
 
-def tune(command, params, config=CONFIG, robot=ROBOT):
-    """The tuning as a run does it; with the lines that it left."""
-    with ThreadPoolExecutor(1) as pool, TemporaryDirectory() as kept:
-        found = tunings.tune_all(
-            Setup(pool, config, robot),
-            {"with": Problem((command,), params)},
-            Path(kept),
-            title="tuning",
-            metrics=Path(kept) / "metrics.jsonl",
-        )
-        lines = (Path(kept) / "metrics.jsonl").read_text().splitlines()
-    return found["with"].tuning, [json.loads(line) for line in lines]
-
-
-def call(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["hector", *map(str, arguments)])
-    return main()
+def tune(command, rule="relative", robot=ROBOT, effect=EFFECT):
+    scenario = Scenario(robot, command, standing_anchor(robot), effect)
+    return difftune.tune(replace(CONFIG, rule=rule), scenario, nominal())
 
 
 def inside(weights):
-    lower, upper, vector = (np.asarray(weights_to_vector(w)) for w in (*bounds(), weights))
-    return bool(((lower <= vector) & (vector <= upper)).all())  # NaN is not
+    lower, upper, at = (weights_to_vector(w) for w in (*bounds(), weights))
+    return bool(((lower <= at) & (at <= upper)).all())  # NaN is not
 
 
 def furthest(weights):
     """The largest change of a weight from nominal, in logs."""
-    vector, start = (np.asarray(weights_to_vector(w)) for w in (weights, nominal()))
-    return np.abs(np.log(vector / start)).max()
-
-
-@pytest.mark.parametrize("rule", RULES)
-def test_without_a_fault_nothing_is_refused_as_one(params, rule):
-    found, lines = tune(told(), params, replace(CONFIG, rule=rule))
-    assert len(lines) == len(found.iterations) > 1
-    if rule == "relative":
-        assert all(line["accepted"] for line in lines)
-        assert found.reason == "14 iterations"
-    assert {line["reason"] for line in lines} <= {"", "the loss did not fall as predicted"}
+    return np.abs(np.log(weights_to_vector(weights) / weights_to_vector(nominal()))).max()
 
 
 @pytest.mark.parametrize("fault", REASONS)
 @pytest.mark.parametrize("rule", RULES)
-def test_a_fault_is_refused_and_shrunk_and_the_run_goes_on(params, fault, rule):
+def test_a_fault_is_refused_and_shrunk_and_the_run_goes_on(fault, rule):
     reach = REACH[rule]
-    found, lines = tune(told(fault, reach), params, replace(CONFIG, rule=rule))
-    assert [line["step"] for line in lines[:2]] == [0.0, 1.0]
-    assert [line["accepted"] for line in lines[:2]] == [True, False]
-    first = next(i for i, line in enumerate(lines[1:], 1) if line["accepted"])
-    assert {line["reason"] for line in lines[1:first]} == {REASONS[fault]}
-    for before, line in zip(lines[1:], lines[2:], strict=False):
-        if not before["accepted"]:
-            assert line["step"] == pytest.approx(before["step"] / RULES[rule])
+    found = tune(told(fault, reach), rule)
+    rows = found.iterations
+    assert [float(row.step_size) for row in rows[:2]] == [0.0, 1.0]
+    assert [row.accepted for row in rows[:2]] == [True, False]
+    first = next(i for i, row in enumerate(rows[1:], 1) if row.accepted)
+    assert {row.reason for row in rows[1:first]} == {REASONS[fault]}
+    for before, row in zip(rows[1:], rows[2:], strict=False):
+        if not before.accepted:
+            assert float(row.step_size) == pytest.approx(before.step_size / RULES[rule])
         elif rule == "relative":
-            assert line["step"] == min(1.0, 2.0 * before["step"])
-    reasons = Counter(line["reason"] for line in lines if not line["accepted"])
-    assert reasons.keys() <= {REASONS[fault], "the loss did not fall as predicted"}
-    assert reasons[REASONS[fault]] >= first - 1
-    refused = sum(not line["accepted"] for line in lines)
-    section = tuning_section("with", found)
-    assert f"{len(lines) - 1} iterations, {refused} refused" in section
-    assert all(inside(iteration.weights) for iteration in found.iterations)
-    assert all(furthest(i.weights) <= reach for i in found.iterations if i.accepted)
+            assert row.step_size == min(1.0, 2.0 * before.step_size)
+    reasons = {row.reason for row in rows if not row.accepted}
+    assert reasons <= {REASONS[fault], "the loss did not fall as predicted"}
+    assert all(inside(row.weights) for row in rows)
+    assert all(furthest(row.weights) <= reach for row in rows if row.accepted)
     assert 0.0 < furthest(found.weights) <= reach
     assert np.isfinite(found.precision).all()
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_where_every_step_is_refused_the_run_ends_with_the_reason(params, rule):
-    config = replace(CONFIG, rule=rule)
-    found, lines = tune(told(Fault.FALL), params, config)
-    assert not any(line["accepted"] for line in lines[1:])
-    assert {line["reason"] for line in lines[1:]} == {REASONS[Fault.FALL]}
-    steps = [RULES[rule] ** -i for i in range(len(lines) - 1)]
-    np.testing.assert_allclose([line["step"] for line in lines[1:]], steps)
+def test_where_every_step_is_refused_the_run_ends_with_the_reason(rule):
+    found = tune(told(Fault.FALL), rule)
+    rows = found.iterations[1:]
+    assert {row.reason for row in rows} == {REASONS[Fault.FALL]}
+    steps = [RULES[rule] ** -i for i in range(len(rows))]
+    np.testing.assert_allclose([row.step_size for row in rows], steps)
     expected = Stop.NO_GAIN if rule == "gauss_newton" else Stop.SMALL_STEP
     assert Stop(int(found.stop)) == expected
     jax.tree.map(np.testing.assert_array_equal, found.weights, nominal())
 
 
-def spoilt_net(params):
-    kernel = params.force["Dense_0"]["kernel"].at[0, 0, 0].set(jnp.nan)
-    force = {**params.force, "Dense_0": {**params.force["Dense_0"], "kernel": kernel}}
-    return told(), params._replace(force=force), ROBOT
-
-
-def crouched(params):
-    return told(), params, ROBOT._replace(standing_height=np.asarray(0.1))
-
-
-@pytest.mark.parametrize(
-    ("spoil", "reason"), [(spoilt_net, "loss or gradient not finite"), (crouched, "the robot fell")]
-)
-def test_a_start_that_cannot_be_believed_ends_the_run(params, spoil, reason):
-    command, net, robot = spoil(params)
-    with pytest.raises(ValueError, match=f"the starting weights cannot be tuned from: {reason}"):
-        tune(command, net, robot=robot)
+def test_a_start_that_cannot_be_believed_ends_the_run():
+    spoilt = jax.tree.map(lambda x: jnp.nan * x if x.dtype.kind == "f" else x, EFFECT)
+    crouched = ROBOT._replace(standing_height=np.asarray(0.1))
+    words = "the starting weights cannot be tuned from:"
+    with pytest.raises(InputError, match=f"{words} loss or gradient not finite"):
+        tune(told(), effect=spoilt)
+    with pytest.raises(InputError, match=f"{words} the robot fell"):
+        tune(told(), robot=crouched)
 
 
 # Numbers that no rollout gives
 
 NUMBERS = [np.nan, np.inf, -np.inf, 1.7e308, -1.7e308, 1e-308, 5e-324, 0.0]
-
-
-def evaluated(loss, gradient):
-    one = np.asarray(1.0)
-    loss = np.asarray(float(loss))
-    tree = jax.tree.map(lambda w: np.full_like(w, gradient), nominal())
-    terms = dict.fromkeys(("L_Eul", "L_pos", "L_ctrl"), one)
-    return Evaluation(loss, terms, tree, np.asarray(0.0), np.asarray(1e-12))
 
 
 @pytest.mark.parametrize("number", NUMBERS)
@@ -239,8 +176,10 @@ def test_no_number_makes_weights_that_are_not_finite(number, rule, where, begin)
 
     def look(weights):
         looks["all"] += 1
-        odd = {where: number} if looks["all"] >= begin and where != "matrix" else {}
-        return evaluated(**{"loss": 1.0 / looks["all"], "gradient": 1e-3, **odd})
+        odd = {where: number} if looks["all"] >= begin else {}
+        gradient = jax.tree.map(lambda w: np.full_like(w, odd.get("gradient", 1e-3)), nominal())
+        loss = np.asarray(float(odd.get("loss", 1.0 / looks["all"])))
+        return Evaluation(loss, {}, gradient, np.asarray(0.0), np.asarray(1e-12))
 
     def matrix(weights):
         odd = where == "matrix" and looks["all"] >= begin

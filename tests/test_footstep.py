@@ -43,30 +43,23 @@ def test_a_robot_that_stands_still_puts_its_feet_under_its_hips(yaw):
     np.testing.assert_allclose(heading, yaw)
 
 
-def test_at_the_commanded_speed_a_foot_lands_half_a_stance_ahead():
-    now = state(velocity=(0.5, 0.0, 0.0))
+def test_a_foot_lands_half_a_stance_ahead_and_further_by_the_feedback_if_too_fast():
+    now = state(velocity=(0.5, 0.2, 0.0))
     points, _ = feet(now, now)
-    np.testing.assert_allclose(points[:, 0], 0.5 * (WAIT + STANCE / 2))
-    np.testing.assert_allclose(points[:, 1], [0.08, -0.08])
-
-
-def test_too_fast_steps_further_by_the_feedback():
-    now, wanted = state(velocity=(0.5, 0.2, 0.0)), state(velocity=(0.3, 0.2, 0.0))
-    ahead = FootstepConfig(feedback=0.2)
-    points, more = feet(now, wanted)[0], feet(now, wanted, ahead)[0]
-    np.testing.assert_allclose(more - points, [[0.08 * 0.2, 0.0, 0.0]] * 2, atol=1e-12)
+    ahead = 0.5 * (WAIT + STANCE / 2)
+    np.testing.assert_allclose(points[:, 0], ahead)
+    np.testing.assert_allclose(points[:, 1], 0.4 * ahead + np.array([0.08, -0.08]))
+    wanted, more = state(velocity=(0.3, 0.2, 0.0)), FootstepConfig(feedback=0.2)
+    further = feet(now, wanted, more)[0] - feet(now, wanted)[0]
+    np.testing.assert_allclose(further, [[0.08 * 0.2, 0.0, 0.0]] * 2, atol=1e-12)
 
 
 def test_the_sway_of_this_moment_carries_one_swing_at_most():
     swaying = state(velocity=(0.0, 0.3, 0.0))
-    far, near = (
-        feet(swaying, state(), wait=jnp.array([wait, 0.1]))[0][0, 1] for wait in (0.39, 0.21)
-    )
-    assert far == pytest.approx(near)
-    closer, close = (
-        feet(swaying, state(), wait=jnp.array([wait, 0.1]))[0][0, 1] for wait in (0.15, 0.05)
-    )
-    assert closer - close == pytest.approx(0.03)
+    waits = (0.39, 0.21, 0.15, 0.05)
+    left = [feet(swaying, state(), wait=jnp.array([wait, 0.1]))[0][0, 1] for wait in waits]
+    assert left[0] == pytest.approx(left[1])
+    assert left[2] - left[3] == pytest.approx(0.03)
 
 
 def test_in_a_turn_the_feet_land_on_the_outside():
@@ -82,22 +75,11 @@ def test_a_foot_points_to_the_heading_of_the_middle_of_its_stance():
 
 
 @pytest.mark.parametrize("config", [RAIBERT, PAPER])
-def test_a_mirrored_robot_steps_to_the_mirrored_points(config):
+def test_a_mirrored_robot_steps_to_the_mirrored_points_and_a_yawed_one_to_the_yawed(config):
+    flip, turn, R = jnp.array([1.0, -1.0, 1.0]), jnp.array([-1.0, 1.0, -1.0]), rot_z(jnp.array(1.1))
+
     def mirrored(s):
-        flip, turn = jnp.array([1.0, -1.0, 1.0]), jnp.array([-1.0, 1.0, -1.0])
         return State(s.euler * turn, s.position * flip, s.ang_velocity * turn, s.velocity * flip)
-
-    now = state((0.3, 0.1, 0.5), (0.4, 0.2, 0.1), yaw=0.4)
-    wanted = state((0.2, 0.0, 0.5), (0.5, 0.1, 0.0), yaw=0.3, yaw_rate=1.2)
-    points, yaw = feet(now, wanted, config)
-    other, other_yaw = feet(mirrored(now), mirrored(wanted), config, WAIT[::-1])
-    np.testing.assert_allclose(other, points[::-1] * np.array([1.0, -1.0, 1.0]), atol=1e-12)
-    np.testing.assert_allclose(other_yaw, -yaw[::-1])
-
-
-@pytest.mark.parametrize("config", [RAIBERT, PAPER])
-def test_a_yawed_robot_steps_to_the_yawed_points(config):
-    R = rot_z(jnp.array(1.1))
 
     def turned(s):
         return State(s.euler.at[2].add(1.1), R @ s.position, s.ang_velocity, R @ s.velocity)
@@ -105,6 +87,9 @@ def test_a_yawed_robot_steps_to_the_yawed_points(config):
     now = state((0.3, 0.1, 0.5), (0.4, 0.2, 0.1), yaw=0.4)
     wanted = state((0.2, 0.0, 0.5), (0.5, 0.1, 0.0), yaw=0.3, yaw_rate=1.2)
     points, yaw = feet(now, wanted, config)
+    other, other_yaw = feet(mirrored(now), mirrored(wanted), config, WAIT[::-1])
+    np.testing.assert_allclose(other, points[::-1] * flip, atol=1e-12)
+    np.testing.assert_allclose(other_yaw, -yaw[::-1])
     other, other_yaw = feet(turned(now), turned(wanted), config)
     np.testing.assert_allclose(other, points @ R.T, atol=1e-12)
     np.testing.assert_allclose(other_yaw, yaw + 1.1)

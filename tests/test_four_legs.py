@@ -16,13 +16,13 @@ from hector_jax.cli.main import main
 from hector_jax.control.controller import walk_config
 from hector_jax.control.legs import stance_torques
 from hector_jax.core.inputs import InputError
-from hector_jax.core.trajectory import FEET, State, Wrench, pack_wrench
+from hector_jax.core.trajectory import FEET, State, Wrench
 from hector_jax.importing.propose import propose_robot
 from hector_jax.importing.remarks import remarks
 from hector_jax.importing.survey import survey_file
-from hector_jax.robot import srbm
+from hector_jax.robot.checks import standing_data
 from hector_jax.robot.description import description_of
-from hector_jax.robot.kinematics import foot_poses, leg_gravity
+from hector_jax.robot.kinematics import leg_gravity
 from hector_jax.robot.model import compile_model, load_robot, robot_of
 
 FILE = Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml"
@@ -30,10 +30,6 @@ MODEL = FILE.with_name("quadruped.xml")
 ROBOT = load_robot(FILE)
 LEGS = FEET[4]
 TABLE = FILE.read_text()
-
-
-def joints_of(leg):
-    return [f"{leg}_{joint}" for joint in ("roll", "pitch", "knee")]
 
 
 def changed(folder, *changes):
@@ -45,9 +41,6 @@ def changed(folder, *changes):
     path = folder / "quadruped.xml"
     path.write_text(text)
     return path
-
-
-# What is found and proposed
 
 
 def test_the_example_is_what_is_proposed_for_its_model():
@@ -68,75 +61,54 @@ def test_legs_are_found_in_any_order_and_by_any_name(tmp_path):
     path.write_text(text)
     found = survey_file(path)
     names = [[found.model.joint(j).name for j in leg] for leg in found.legs]
-    assert names == [joints_of(f"part{i}") for i in range(4)]
+    assert names == [[f"part{i}_{joint}" for joint in ("roll", "pitch", "knee")] for i in range(4)]
     assert propose_robot(path).wrong == ()
 
 
-def test_motors_without_armature_get_one_by_their_torque(tmp_path):
+def test_motors_without_armature_get_one_by_their_torque_and_are_told(tmp_path):
     proposal = propose_robot(changed(tmp_path, (' armature="0.01"', "")))
-    assert proposal.table["joints"]["armature"] == pytest.approx(
-        2e-4 * ROBOT.torque_limit[:3], rel=5e-3
-    )
-    assert "armature" not in tomllib.loads(TABLE)["joints"]
+    expected = 2e-4 * ROBOT.torque_limit[:3]
+    assert proposal.table["joints"]["armature"] == pytest.approx(expected, rel=5e-3)
     assert remarks(ROBOT) == []
     (line,) = remarks(robot_of(replace(ROBOT.description, model=tmp_path / "quadruped.xml")))
     assert line.startswith("joint 'front_left_roll' has no armature")
 
 
-HIND_PITCH = ("-0.5236 4.5379", "-4.5379 0.5236")
-HIND_KNEES = (r'(?=<joint name="hind_\w+_knee")<joint', '<joint range="0.83776 2.7227"')
-
-
 def test_hind_knees_that_bend_the_other_way_are_told_and_stand(tmp_path, monkeypatch, capsys):
-    path = changed(tmp_path, HIND_KNEES, HIND_PITCH)
+    knees = (r'(?=<joint name="hind_\w+_knee")<joint', '<joint range="0.83776 2.7227"')
+    path = changed(tmp_path, knees, ("-0.5236 4.5379", "-4.5379 0.5236"))
     proposal = propose_robot(path)
     assert proposal.wrong == ()
     assert proposal.survey.forwards == (False, True)
     angles = proposal.table["standing"]
     for joint in ("pitch", "knee"):
-        assert angles[f"hind_left_{joint}"] == pytest.approx(
-            -angles[f"front_left_{joint}"], abs=1e-3
-        )
+        front, hind = (angles[f"{pair}_left_{joint}"] for pair in ("front", "hind"))
+        assert hind == pytest.approx(-front, abs=1e-3)
     monkeypatch.setattr(sys, "argv", ["hector", "robot", str(path)])
     assert main() == 0
     assert "knees bend backwards in front and forwards behind" in capsys.readouterr().out
 
 
+def test_a_shank_without_a_foot_stands_on_a_point_that_is_guessed_from_its_inertia(tmp_path):
+    bare = ('size="0.012"', 'size="0.012" contype="0" conaffinity="0"')  # 0.202 m long
+    proposal = propose_robot(changed(tmp_path, ('<geom class="foot"/>', ""), bare))
+    assert proposal.error is None
+    assert any("guessed" in line for line in proposal.wrong)
+    for sole in proposal.soles:
+        assert sole.guessed
+        assert len(sole.contacts) == 1
+        assert np.linalg.norm(sole.contacts) == pytest.approx(0.202, abs=0.005)
+
+
 def test_pairs_that_are_not_alike_are_refused(tmp_path):
     toe = r'<body pos="0 0 -0.2"><joint name="\1_toe"/><geom size="0.01"/></body>'
     hind = (r'(?s)(hind_\w+)_calf".*?<geom class="foot"/>', rf"\g<0>{toe}")
-    with pytest.raises(
-        InputError, match=r"2 pairs of chains of \[4, 3\] hinges end as low as legs"
-    ):
-        survey_file(changed(tmp_path, hind))
-
-
-# What is read
-
-
-def posed():
-    """MuJoCo's model and data, standing."""
-    model = compile_model(ROBOT.description)
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    mujoco.mj_forward(model, data)
-    return model, data
-
-
-def test_feet_are_pairs_from_the_front_and_mirror_images():
-    assert ROBOT.description.legs == LEGS
-    assert ROBOT.structure.contact == "point"
-    assert ROBOT.structure.placed == (0, 1, 2)
-    assert ROBOT.joint_origin.shape == (4, 3, 3)
-    np.testing.assert_allclose(ROBOT.foot_ahead, [0.1934] * 2 + [-0.1934] * 2, atol=1e-4)
-    feet = foot_poses(ROBOT, jnp.asarray(ROBOT.standing_joints)).position
-    np.testing.assert_allclose(feet[1::2], feet[::2] * np.array([1, -1, 1]), atol=1e-12)
-    mirrored = ROBOT.inertia * np.outer([1, -1, 1], [1, -1, 1])
-    np.testing.assert_allclose(mirrored, ROBOT.inertia, atol=1e-9)
+    error = propose_robot(changed(tmp_path, hind)).error
+    assert "2 pairs of chains of [4, 3] hinges end as low as legs" in error
 
 
 def test_joint_torques_of_four_feet_are_the_statics_of_mujoco():
-    model, data = posed()
+    data = standing_data(ROBOT.description, compile_model(ROBOT.description))
     points = np.array([data.site(foot.point).xpos for foot in ROBOT.description.named_feet])
     arms = points - data.subtree_com[1]
     # the least vertical forces that balance weight and moments
@@ -145,70 +117,37 @@ def test_joint_torques_of_four_feet_are_the_statics_of_mujoco():
     force = np.linalg.lstsq(A, [weight, 0.0, 0.0])[0][:, None] * [0.0, 0.0, 1.0]
     need = data.qfrc_bias.copy()
     for foot, of_foot in zip(ROBOT.description.named_feet, force, strict=True):
-        J = np.zeros((3, model.nv))
-        mujoco.mj_jacSite(model, data, J, None, model.site(foot.point).id)
+        J = np.zeros((3, len(need)))
+        mujoco.mj_jacSite(data.model, data, J, None, data.site(foot.point).id)
         need -= J.T @ of_foot
     np.testing.assert_allclose(need[:6], 0.0, atol=1e-9)
     joints = jnp.asarray(ROBOT.standing_joints)
     state = State(*jnp.zeros((4, 3)))._replace(position=jnp.asarray(data.subtree_com[1]))
-
-    @jax.jit
-    def torques(wrench):
-        weight = leg_gravity(ROBOT, joints, jnp.asarray(ROBOT.gravity))
-        return stance_torques(ROBOT, state, joints, wrench) + weight
-
-    found = torques(Wrench(jnp.asarray(force), jnp.zeros((4, 3))))
+    wrench = Wrench(jnp.asarray(force), jnp.zeros((4, 3)))
+    held = jax.jit(leg_gravity)(ROBOT, joints, jnp.asarray(ROBOT.gravity))
+    found = jax.jit(stance_torques)(ROBOT, state, joints, wrench) + held
     np.testing.assert_allclose(found, need[6:], atol=1e-8)
 
 
-def test_the_linearisation_has_a_column_for_each_force_and_moment():
-    rng = np.random.default_rng(0)
-    euler, dt = jnp.array([0.0, 0.0, 0.6]), 0.01
-    state = State(euler, jnp.array([0.0, 0.0, 0.36]), *jnp.zeros((2, 3)))
-    feet = jnp.asarray(rng.uniform(-0.3, 0.3, (4, 3)))
-    _, B = jax.jit(lambda levers: srbm.linearise(ROBOT, euler, levers, dt))(feet - state.position)
-    assert B.shape == (15, 24)
-
-    @jax.jit
-    def moved(wrench):
-        rate = srbm.rates(jax.tree.map(jnp.asarray, ROBOT), state, wrench, feet)
-        return jnp.concatenate([*(dt * x for x in rate), jnp.zeros(3)])
-
-    wrench = Wrench(*jnp.asarray(rng.normal(size=(2, 4, 3))))
-    free = moved(jax.tree.map(jnp.zeros_like, wrench))
-    packed = np.asarray(pack_wrench(wrench))
-    np.testing.assert_allclose(np.asarray(B) @ packed, moved(wrench) - free, atol=1e-12)
-
-
-# What is refused
-
-
-def swap(table, *legs):
-    """Swap joints and feet of two legs, or of two pairs."""
-    for part in ("joints", "feet"):
-        for one, other in legs:
-            table[part][one], table[part][other] = table[part][other], table[part][one]
+def swap_hind_legs(table):
+    for part in (table["joints"], table["feet"]):
+        part["hind_left"], part["hind_right"] = part["hind_right"], part["hind_left"]
 
 
 WRONG = {
     "must have left, right; or front_left, front_right, hind_left, hind_right, got front_left, "
     "front_right, hind_left$": lambda t: t["feet"].pop("hind_right"),
     "joints: must have .* got left, front_left": lambda t: t["joints"].update(left=["a", "b", "c"]),
-    "feet: unknown field 'rear_left'": lambda t: t["feet"].update(rear_left={}),
     "feet.hind_left.body is 'front_left_calf', expected one that joint 'hind_left_knee'": (
         lambda t: t["feet"]["hind_left"].update(body="front_left_calf")
     ),
-    "different names, got 'front_left_roll' twice": lambda t: t["joints"].update(
-        hind_left=t["joints"]["front_left"]
+    "different names, got 'front_left_roll' twice": (
+        lambda t: t["joints"].update(hind_left=t["joints"]["front_left"])
     ),
-    r"as many contacts, got \[2, 1, 1, 1\]": lambda t: t["feet"].update(
-        front_left={"point": "sole", "toe": "toe", "heel": "heel"}
+    r"as many contacts, got \[2, 1, 1, 1\]": (
+        lambda t: t["feet"].update(front_left={"point": "sole", "toe": "toe", "heel": "heel"})
     ),
-    "the hind_left foot at y = -0.142, expected it left of the hind_right one": lambda t: swap(
-        t, ("hind_left", "hind_right")
-    ),
-    "no joint 'knee'": lambda t: t["joints"]["hind_left"].__setitem__(2, "knee"),
-    "1, 2 or 4 contacts": lambda t: t["feet"]["hind_left"].update(contacts=[[0, 0, 0]] * 3),
+    "the hind_left foot at y = -0.142, expected it left of the hind_right one": swap_hind_legs,
     "expert: missing field 'moment'": lambda t: t["weights"]["expert"].pop("moment"),
 }
 

@@ -24,9 +24,8 @@ from hector_jax.control.legs import LegConfig
 from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.trajectories import load_command
 from hector_jax.control.weights import expert
-from hector_jax.control.weights_file import load_weights, save_weights
+from hector_jax.control.weights_file import load_weights
 from hector_jax.core.inputs import InputError, short_repr
-from hector_jax.core.settings import convert
 from hector_jax.core.tree_file import save_tree
 from hector_jax.grfm import collection, network
 from hector_jax.grfm.training import TrainConfig
@@ -40,20 +39,12 @@ from hector_jax.tuning.rollout import RolloutConfig
 
 ROBOT = load_robot()
 
-hundreds = settings(
-    max_examples=300,
-    derandomize=True,
-    database=None,
-    deadline=None,
-    suppress_health_check=list(HealthCheck),
-)
+QUIET = {"database": None, "deadline": None, "suppress_health_check": list(HealthCheck)}
+hundreds = settings(max_examples=300, derandomize=True, **QUIET)
 
-NUMBERS = st.one_of(
-    st.sampled_from([0, -1, 1, 0.0, -1.0, 0.5, 1e308, -1e-308, 2**63, -(10**400), 10**400]),
-    st.sampled_from([float("nan"), float("inf"), float("-inf")]),
-    st.integers(-1000, 1000),
-    st.floats(-1e6, 1e6),
-)
+ODD = [0, -1, 1, 0.0, -1.0, 0.5, 1e308, -1e-308, 2**63, -(10**400), 10**400]
+ODD += [float("nan"), float("inf"), float("-inf")]
+NUMBERS = st.one_of(st.sampled_from(ODD), st.integers(-1000, 1000), st.floats(-1e6, 1e6))
 WORDS = st.one_of(
     st.sampled_from(["", "weigth", "nan", "1", "../x", "papier"]), st.text(max_size=9)
 )
@@ -73,22 +64,8 @@ def one_line(error):
 
 # Settings
 
-CONFIGS = (
-    GaitConfig,
-    FootstepConfig,
-    LegConfig,
-    QpConfig,
-    MpcConfig,
-    WalkConfig,
-    RolloutConfig,
-    TuneConfig,
-    SearchConfig,
-    TrainConfig,
-    CollectConfig,
-    SceneConfig,
-    VideoConfig,
-)
-FIELDS = [(kind, field) for kind in CONFIGS for field in dataclasses.fields(kind)]
+CONFIGS = (GaitConfig, FootstepConfig, LegConfig, QpConfig, MpcConfig, WalkConfig, VideoConfig)
+CONFIGS += (RolloutConfig, TuneConfig, SearchConfig, TrainConfig, CollectConfig, SceneConfig)
 SIGNED = {"LegConfig.landing", "FootstepConfig.feedback", "FootstepConfig.turn"}
 
 
@@ -104,54 +81,31 @@ def made(kind, **values):
     return config
 
 
-def validation_error(*value):
-    """The message of a value; None if it is valid."""
-    try:
-        convert(*value)
-    except InputError as error:
-        return str(error)
-
-
-@hundreds
-@given(st.sampled_from(FIELDS), st.one_of(JUNK, st.lists(JUNK, max_size=5).map(tuple)))
-def test_settings_are_taken_or_refused_by_field_and_value(place, value):
-    kind, field = place
-    try:
-        made(kind, **{field.name: value})
-    except ValueError as error:
-        message = one_line(error)
-        assert message.startswith(f"{kind.__name__}.")
-        assert field.name in message
-        assert "must " in message
-        named = (
-            (value, *value) if isinstance(value, tuple) else (value,)
-        )  # or the part that is wrong
-        assert any(short_repr(one) in message or repr(one)[:20] in message for one in named)
-    else:
-        assert validation_error(value, field.type) is None
-
-
-@pytest.mark.parametrize(
-    ("kind", "field"), FIELDS, ids=[f"{k.__name__}.{f.name}" for k, f in FIELDS]
-)
-def test_no_setting_takes_a_nan_a_word_or_a_number_below_its_range(kind, field):
-    name = f"{kind.__name__}.{field.name}"
-    numeric = {int, float} & {field.type, *get_args(field.type)}
-    wrong = [float("nan"), float("inf"), -1e9, 10**400] if numeric else [float("nan"), 3]
-    for value in [*wrong, "weigth", [], {}]:
-        if name in SIGNED and value == -1e9:
-            continue
-        value = (value,) * 5 if get_origin(field.type) is tuple else value
-        if validation_error(value, field.type) is None and field.type is bool:
-            continue
-        with pytest.raises(ValueError, match=name):
-            made(kind, **{field.name: value})
-
-
-def test_defaults_and_numpy_numbers_are_taken():
+def refused_settings():
+    """By field: what is no number of its range, no word that it knows, and of another type."""
     for kind in CONFIGS:
-        assert made(kind) == kind()
+        for field in dataclasses.fields(kind):
+            numeric = {int, float} & {field.type, *get_args(field.type)}
+            numbers = [float("inf"), 10**400, -1e9] if numeric else [3]
+            if f"{kind.__name__}.{field.name}" in SIGNED:
+                numbers.remove(-1e9)
+            for value in (float("nan"), *numbers, "weigth", [], {}):
+                value = (value,) * 5 if get_origin(field.type) is tuple else value
+                yield kind, field.name, value
+    for names in (("weigth",), ("",), ("friction", "kp"), ("foot_height",)):
+        yield TuneConfig, "others", names
+
+
+def test_settings_are_refused_by_field_and_value():
     assert made(MpcConfig, horizon=np.int64(5), friction=np.float64(0.5)).horizon == 5
+    for kind, name, value in refused_settings():
+        with pytest.raises(InputError) as caught:
+            made(kind, **{name: value})
+        message = one_line(caught.value)
+        assert message.startswith(f"{kind.__name__}.{name}")
+        assert "must " in message
+        parts = (value, *value) if isinstance(value, tuple) else (value,)
+        assert any(short_repr(one) in message or repr(one)[:20] in message for one in parts)
 
 
 # One case a line: of each kind of fault one, for each loader
@@ -159,11 +113,8 @@ def test_defaults_and_numpy_numbers_are_taken():
 
 def edited(part, entry, value):
     """The text of a file of weights with another entry."""
-    tree = {
-        "Q": {n: [1.0, 2.0, 3.0] for n in ("euler", "position", "ang_velocity", "velocity")},
-        "R": {n: [[1e-4, 1e-4, 1e-4]] * 2 for n in ("force", "moment")},
-        "others": {},
-    }
+    tree = {"Q": {}, "R": {"force": [[1e-4] * 3] * 2, "moment": [[1e-4] * 3] * 2}, "others": {}}
+    tree["Q"] |= {n: [1.0, 2.0, 3.0] for n in ("euler", "position", "ang_velocity", "velocity")}
     tree[part][entry] = value
     return json.dumps(tree)
 
@@ -181,42 +132,26 @@ REFUSED = [
     ("weights.json", edited("Q", "eular", [1, 1, 1]), "weight 'Q.eular'; did you mean 'Q.euler'"),
     ("weights.json", edited("Q", "euler", [1, -1, 1]), "Q.euler[1] must be a number from 1e-12"),
     ("weights.json", edited("Q", "euler", [1, 1, True]), "Q.euler[2] must be a number"),
-    ("weights.json", edited("Q", "euler", [1, float("nan"), 1]), "got nan"),
-    ("weights.json", edited("Q", "euler", [1, 1]), "Q.euler must be 3 numbers, got"),
     ("weights.json", edited("R", "force", [[1, 1, 1], [1]]), "R.force must be 2 x 3 numbers, got"),
-    ("weights.json", edited("others", "frition", 1), "did you mean 'others.friction'"),
     ("weights.json", edited("others", "friction", 2), "others.friction must be a number from 0.1"),
-    ("weights.json", edited("others", "kp", [9, 9, 9]), "others.kp must be 5 numbers, got"),
-    ("weights.json", "", ""),
-    ("weights.json", "\udc80", ""),
     ("weights.json", '{"Q": 1, "Q": 2}', ""),
     ("weights.json", "[" * 100_000, ""),
     ("tune.toml", "sedes = 3", "unknown field 'sedes'; did you mean 'seeds'?"),
     ("tune.toml", 'config = "other.toml"', "config stands on the line only"),
-    ("tune.toml", 'seeds = "3"', "seeds must be a whole number from 1 to 10000, got '3'"),
     ("tune.toml", "seeds = 3.0", "seeds must be a whole number from 1 to 10000, got 3.0"),
     ("tune.toml", "video = 1", "video must be true or false, got 1"),
-    ("tune.toml", "seeds = ", "not valid TOML: "),
     ("tune.toml", "seeds = 1\nseeds = 2", "not valid TOML: "),
     ("tune.toml", "\udcff\udcfe", "not a text file"),
     ("tune.json", "[]", "no `flags` in it"),
-    ("tune.json", '{"flags": {"seeds": null}}', "seeds must be a whole number"),
-    ("tune.json", "[" * 100_000, "not valid"),
     ("evaluate.toml", 'world = "standing"', "did you mean 'standin'"),
-    ("evaluate.toml", "seconds = 0", "seconds must be a number from 0.01 to 600, got 0"),
     ("evaluate.toml", "seconds = nan", "seconds must be a number from 0.01 to 600, got nan"),
-    ("evaluate.toml", f"seconds = 1{400 * '0'}", "from 0.01 to 600, got 1000"),
-    ("course.toml", "", "missing field 'name'"),
     ("course.toml", 'name = "mine"', "missing field 'segment'"),
-    ("course.toml", "name = 3\nsegment = [{seconds = 1}]", "name must be text, got 3"),
     ("course.toml", 'name = "s"\nsegment = [{seconds = 1}]', "built-in trajectory"),
     ("course.toml", HEAD + "vx = 0.3", "segment 1: unknown field 'vx'; did you mean 'v_x'"),
     ("course.toml", HEAD + "v_x = nan", "segment 1: v_x must be a number from -10 to 10, got nan"),
     ("course.toml", HEAD + f"v_x = 0x{'f' * 9000}", "too many digits"),
-    ("course.toml", HEAD + "[[segment]]\nv_x = 1.0", "segment 2: missing field 'seconds'"),
-    ("course.toml", HEAD + "[[segment]]\nseconds = -1", "segment 2: seconds must be"),
     ("course.toml", HEAD + "[[segment]]\nseconds = 600", "at most 600 s together, got 601"),
-    *((name, None, "No such file") for name in ("tune.toml", "course.toml")),
+    ("course.toml", None, "No such file"),
 ]
 
 
@@ -241,19 +176,16 @@ def folder(tmp_path_factory):
 
 def places(tree, at=()):
     """Where something can be changed in nested dictionaries and lists."""
-    yield at
-    inner = tree.items() if isinstance(tree, dict) else enumerate(tree)
-    for key, value in inner:
+    for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree):
+        yield (*at, key)
         if isinstance(value, dict | list):
             yield from places(value, (*at, key))
-        else:
-            yield (*at, key)
 
 
 def changed(data, tree):
     """The tree with one thing replaced, renamed, taken away or put in."""
     tree = json.loads(json.dumps(tree))
-    at = data.draw(st.sampled_from([place for place in places(tree) if place]))
+    at = data.draw(st.sampled_from([*places(tree)]))
     holder = tree
     for key in at[:-1]:
         holder = holder[key]
@@ -277,11 +209,21 @@ def torn(data, content):
     begin = data.draw(st.integers(0, len(content)))
     length = data.draw(st.integers(0, 20))
     put = data.draw(st.one_of(PRINTABLE, PRINTABLE, st.binary(max_size=8)))
-    return content[:begin] + put + content[begin + length :]
+    other = content[:begin] + put + content[begin + length :]
+    assume(other != content)
+    return other
 
 
-def refused_or(load, path):
+def spoilt(data, tree, write=json.dumps):
+    """A file's bytes with a fault in what they say, or in themselves."""
+    if data.draw(st.booleans()):
+        return write(changed(data, tree)).encode(errors="surrogatepass")
+    return torn(data, write(tree).encode())
+
+
+def taken(load, path, content):
     """What comes of a file; None where it is refused, in one line that begins with its name."""
+    path.write_bytes(content)
     try:
         return load(path)
     except ValueError as error:
@@ -290,58 +232,33 @@ def refused_or(load, path):
     return None
 
 
-@pytest.fixture(scope="module")
-def sound_weights(folder):
-    path = folder / "sound.json"
-    save_weights(path, expert())
-    return path.read_bytes()
+def as_toml(tree):
+    """JSON as TOML, but for null, of which there is none."""
+    lines = (
+        f"{json.dumps(k)} = {json.dumps(v, separators=(', ', ' = '))}" for k, v in tree.items()
+    )
+    return "\n".join(lines).replace("NaN", "nan").replace("Infinity", "inf")
 
 
 @hundreds
 @given(st.data())
-def test_weights_files_are_taken_or_refused_in_one_line(folder, sound_weights, data):
-    path = folder / "weights.json"
-    if data.draw(st.booleans()):
-        path.write_text(json.dumps(changed(data, json.loads(sound_weights))))
-    else:
-        path.write_bytes(torn(data, sound_weights))
-    found = refused_or(load_weights, path)
+def test_weights_files_are_taken_or_refused_in_one_line(folder, data):
+    sound = json.loads(edited("others", "friction", 0.5))
+    found = taken(load_weights, folder / "weights.json", spoilt(data, sound))
     if found is not None:
-        for leaf, like in zip(jax.tree.leaves(found), jax.tree.leaves(expert()), strict=True):
+        for leaf, like in zip([*found.Q, *found.R], [*expert().Q, *expert().R], strict=True):
             assert leaf.shape == like.shape
             assert np.all(np.isfinite(leaf) & (leaf > 0))
 
 
-def as_toml(value):
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(k)} = {as_toml(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(as_toml, value)) + "]"
-    return json.dumps(value) if isinstance(value, str | bool) else str(value)  # None is no TOML
-
-
-COURSE = {
-    "name": "mine",
-    "segment": [
-        {"seconds": 1.0, "v_x": 0.3, "v_y": 0.1, "yaw_rate": -0.5},
-        {"seconds": 2, "v_x": 0.0},
-    ],
-}
+PIECE = {"seconds": 1.0, "v_x": 0.3, "v_y": 0.1, "yaw_rate": -0.5}
+COURSE = {"name": "mine", "segment": [PIECE, {"seconds": 2, "v_x": 0.0}]}
 
 
 @hundreds
 @given(st.data())
 def test_trajectories_are_taken_or_refused_in_one_line(folder, data):
-    path = folder / "course.toml"
-    if data.draw(st.booleans()):
-        tree = changed(data, COURSE)
-        text = "\n".join(f"{json.dumps(key)} = {as_toml(value)}" for key, value in tree.items())
-        path.write_bytes(text.encode(errors="surrogatepass"))
-    else:
-        path.write_bytes(
-            torn(data, "\n".join(f"{k} = {as_toml(v)}" for k, v in COURSE.items()).encode())
-        )
-    found = refused_or(load_command, path)
+    found = taken(load_command, folder / "course.toml", spoilt(data, COURSE, as_toml))
     if found is not None:
         rows = len(found.command.duration)
         assert found.command.velocity.shape == (rows, 2)
@@ -351,76 +268,44 @@ def test_trajectories_are_taken_or_refused_in_one_line(folder, data):
         assert 0.05 <= found.seconds <= 600.0
 
 
-def spoilt(data, path):
-    """A sound file of ours with other bytes."""
-    content = path.read_bytes()
-    other = torn(data, content)
-    assume(other != content)
-    path.write_bytes(other)
-
-
 @pytest.fixture(scope="module")
-def net(folder):
-    """A small net of zeros."""
-    path = folder / "sound-net.npz"
+def sound(folder):
+    """The bytes of a small net of zeros, and of a walk in which nothing moves."""
     like = network.empty_params("paper", (3,), WalkConfig())
-    network.save_net(path, like, robot=ROBOT, about={})
-    return path
+    network.save_net(folder / "sound-net.npz", like, robot=ROBOT, about={})
+    shape = lambda x: [1, 5][: x.ndim] + list(x.shape[2:])  # noqa: E731
+    still = jax.tree.map(
+        lambda x: np.zeros([s or n for s, n in zip(x.shape, shape(x), strict=True)]),
+        collection.walks_like(ROBOT),
+    )
+    save_tree(folder / "sound-walk.npz", still, kind="walks", robot=ROBOT, about={})
+    return [(folder / f"sound-{name}.npz").read_bytes() for name in ("net", "walk")]
 
 
 @hundreds
 @given(st.data())
-def test_nets_are_taken_or_refused_in_one_line(folder, net, data):
-    path = folder / "net.npz"
-    path.write_bytes(net.read_bytes())
-    spoilt(data, path)
-    found = refused_or(lambda path: network.load_net(path, ROBOT), path)
+def test_nets_are_taken_or_refused_in_one_line(folder, sound, data):
+    load = lambda path: network.load_net(path, ROBOT)  # noqa: E731
+    found = taken(load, folder / "net.npz", torn(data, sound[0]))
     if found is not None:
         params, variant, _ = found
         assert variant == "paper"
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
 
 
-@pytest.fixture(scope="module")
-def walks(folder):
-    """A collection of one walk in which nothing moves."""
-    home = folder / "walks"
-    shape = lambda x: [1, 5][: x.ndim] + list(x.shape[2:])  # noqa: E731
-    like = collection.walks_like(load_robot())
-    still = jax.tree.map(
-        lambda x: np.zeros([s or n for s, n in zip(x.shape, shape(x), strict=True)]), like
-    )
-    save_tree(home / "walk-00000.npz", still, kind="walks", robot=ROBOT, about={})
-    card = {"walks": 1, "settings": {"controller": "mine"}}
-    (home / "card.json").write_text(json.dumps(card))
-    return {path.name: path.read_bytes() for path in home.iterdir()}
-
-
 @hundreds
 @given(st.data())
-def test_collected_walks_are_taken_or_refused_in_one_line(folder, walks, data):
-    home = folder / "spoilt"
-    home.mkdir(exist_ok=True)
-    for name, content in walks.items():
-        (home / name).write_bytes(content)
+def test_collected_walks_are_taken_or_refused_in_one_line(folder, sound, data):
+    tree = {"walks": 1, "settings": {"controller": "mine"}}
+    card, shard = json.dumps(tree).encode(), sound[1]
     if data.draw(st.booleans()):
-        spoilt(data, home / "walk-00000.npz")
-    elif data.draw(st.booleans()):
-        card = home / "card.json"
-        card.write_text(json.dumps(changed(data, json.loads(card.read_text()))))
+        shard = torn(data, shard)
     else:
-        (home / "card.json").write_bytes(torn(data, walks["card.json"]))
-    found = refused_or(lambda path: collection.load_walks(path.parent, ROBOT), home / "card.json")
+        card = spoilt(data, tree)
+    (folder / "walk-00000.npz").write_bytes(shard)
+    load = lambda path: collection.load_walks(path.parent, ROBOT)  # noqa: E731
+    found = taken(load, folder / "card.json", card)
     if found is not None:
         run = found.trajectory
         assert run.state.euler.shape[:2] == run.fallen.shape == run.residual.shape
         assert len(jax.tree.leaves(found.job)[0]) == len(run.fallen)
-
-
-@pytest.mark.parametrize("value", [("weigth",), ("",), ("friction", "kp"), ("foot_height",)])
-def test_what_cannot_be_tuned_is_refused_by_field_and_value(value):
-    with pytest.raises(InputError) as caught:
-        made(TuneConfig, others=value)
-    message = one_line(caught.value)
-    assert message.startswith("TuneConfig.others must be ")
-    assert short_repr(value) in message

@@ -19,7 +19,7 @@ from hector_jax.control.legs import (
     trunk_position,
 )
 from hector_jax.core.geometry import rotation_from_euler
-from hector_jax.core.trajectory import State, Wrench, zero_wrench
+from hector_jax.core.trajectory import State, Wrench
 from hector_jax.robot.description import Description
 from hector_jax.robot.kinematics import foot_poses, leg_gravity
 from hector_jax.robot.model import compile_model, describe, load_robot
@@ -127,39 +127,23 @@ def test_stance_torques_and_leg_weight_are_the_statics_of_mujoco(share):
 # Swing
 
 
-def test_a_swing_foot_leaves_the_ground_and_lands_where_it_should():
-    np.testing.assert_allclose(path(START, END, jnp.zeros(2)), START, atol=1e-12)
-    landed = END + jnp.array([0.0, 0.0, CONFIG.landing])
-    np.testing.assert_allclose(path(START, END, jnp.ones(2)), landed, atol=1e-12)
-
-
-def test_the_apex_is_in_the_middle():
-    middle = path(START, END, jnp.full(2, 0.5))
-    np.testing.assert_allclose(middle[:, 2], CONFIG.height, atol=1e-6)
-    np.testing.assert_allclose(middle[:, :2], (START + END)[:, :2] / 2)
-    heights = jax.vmap(lambda s: path(START, END, jnp.full(2, s))[:, 2])(jnp.linspace(0, 1, 41))
-    assert heights.max() == pytest.approx(CONFIG.height)
-    rising = np.diff(heights, axis=0)
+@pytest.mark.parametrize("step_up", [0.0, 0.05])
+def test_a_swing_foot_rises_to_its_apex_halfway_and_is_slow_at_both_ends(step_up):
+    end = END + jnp.array([0.0, 0.0, step_up])
+    along = jax.vmap(lambda s: path(START, end, jnp.full(2, s)))
+    points = np.asarray(along(jnp.linspace(0.0, 1.0, 41)))
+    np.testing.assert_allclose(points[0], START, atol=1e-12)
+    np.testing.assert_allclose(points[40], end + jnp.array([0.0, 0.0, CONFIG.landing]), atol=1e-12)
+    np.testing.assert_allclose(points[20, :, :2], (START + END)[:, :2] / 2)
+    np.testing.assert_allclose(points[20, :, 2], step_up + CONFIG.height, atol=1e-6)
+    rising = np.diff(points[..., 2], axis=0)
     assert (rising[:20] > 0).all()
     assert (rising[20:] < 0).all()
-
-
-@pytest.mark.parametrize("s", [0.0, 0.5, 1.0])
-def test_the_foot_is_slow_at_both_ends_and_nowhere_jumps(s):
-    step = 1e-4
-    speed = (path(START, END, jnp.full(2, s + step)) - path(START, END, jnp.full(2, s - step))) / (
-        2 * step
-    )
-    if s == 0.5:
-        np.testing.assert_allclose(speed[:, :2], 1.5 * (END - START)[:, :2], rtol=1e-6)
-        np.testing.assert_allclose(speed[:, 2], 0.0, atol=1e-3)
-    else:
-        np.testing.assert_allclose(speed, 0.0, atol=1e-3)
-
-
-def test_a_step_up_clears_the_higher_end():
-    high = END + jnp.array([0.0, 0.0, 0.05])
-    assert path(START, high, jnp.full(2, 0.5))[0, 2] == pytest.approx(0.05 + CONFIG.height)
+    at, step = jnp.array([0.0, 0.5, 1.0]), 1e-4
+    begin, middle, last = (along(at + step) - along(at - step)) / (2 * step)
+    np.testing.assert_allclose([begin, last], 0.0, atol=1e-3)
+    np.testing.assert_allclose(middle[:, :2], 1.5 * (END - START)[:, :2], rtol=1e-6)
+    np.testing.assert_allclose(middle[:, 2], 0.0, atol=1e-3)
 
 
 def swing(elapsed, state=None, turn=0.3):
@@ -168,12 +152,12 @@ def swing(elapsed, state=None, turn=0.3):
     return targets(state, START, start_yaw, END, start_yaw + turn, jnp.asarray(elapsed, float))
 
 
-@pytest.mark.parametrize("elapsed", [0.04, 0.13])
-def test_swing_joints_put_the_feet_on_the_path(elapsed):
+@pytest.mark.parametrize("elapsed", [0.04, 0.13, SWING + 0.01, 2 * SWING])
+def test_swing_joints_put_the_feet_on_the_path_and_an_overdue_foot_waits_at_its_end(elapsed):
     state = base((0.0, 0.05, 0.1))
     joints, _ = swing([elapsed] * 2, state)
     position, R = world_feet(state, joints)
-    s = elapsed / SWING
+    s = min(elapsed / SWING, 1.0)
     np.testing.assert_allclose(position, path(START, END, jnp.full(2, s)), atol=1e-9)
     assert np.abs(R[:, 2, 0]).max() < 0.02  # the sole stays level, toe to heel
     turned = 0.1 + np.array([0.05, -0.1]) + 0.3 * s * s * (3 - 2 * s)
@@ -192,13 +176,6 @@ def test_swing_rates_are_the_derivative_of_the_angles_under_a_moving_trunk():
     assert np.abs(rates).max() > 1.0
 
 
-def test_an_overdue_foot_waits_where_it_should_have_landed():
-    state = base()
-    for elapsed in (SWING + 0.01, 2 * SWING):
-        position, _ = world_feet(state, swing([elapsed] * 2, state, turn=0.0)[0])
-        np.testing.assert_allclose(position[:, :2], END[:, :2], atol=1e-9)
-
-
 def test_a_swing_across_half_a_turn_takes_the_short_way():
     state = base((0.0, 0.0, np.pi))
     start_yaw, end_yaw = jnp.full(2, np.pi - 0.1), jnp.full(2, -np.pi + 0.1)
@@ -210,40 +187,29 @@ def test_a_swing_across_half_a_turn_takes_the_short_way():
 # Torques
 
 
-def test_stance_legs_push_and_swing_legs_follow():
-    state = base()
-    wrench = Wrench(jnp.array([[1.0, 2.0, WEIGHT], [0.0, 0.0, 0.0]]), jnp.zeros((2, 3)))
-    joints, rates = STANDS, jnp.zeros(10)
-    target, target_rates = STANDS + 0.05, jnp.full(10, 0.2)
-    found = torques(
-        CONFIG, state, joints, rates, jnp.array([True, False]), wrench, target, target_rates
-    )
-    np.testing.assert_allclose(found[:5], stance(state, joints, wrench)[:5], atol=1e-9)
-    weight = carried(joints, jnp.asarray(ROBOT.gravity))
-    pull = 0.05 * np.array(CONFIG.kp) + 0.2 * np.array(CONFIG.kd)
-    np.testing.assert_allclose(found[5:], pull + weight[5:], atol=1e-9)
-
-
-def test_a_swing_leg_on_its_target_carries_its_own_weight():
-    state, joints = base((0.1, 0.2, 0.3)), STANDS + 0.1
-    rates = jnp.linspace(-1, 1, 10)
-    hangs = jnp.zeros(2, bool)
-    found = torques(CONFIG, state, joints, rates, hangs, zero_wrench(), joints, rates)
-    up = jnp.asarray(ROBOT.gravity) @ rotation_from_euler(state.euler)
-    np.testing.assert_allclose(found, carried(joints, up), atol=1e-9)
-
-
-def test_the_weight_of_a_stance_leg_is_added_on_request():
-    _, wrench = statics(0.5)
-    still, stands = jnp.zeros(10), jnp.ones(2, bool)
-    plain, loaded = (
+def test_stance_legs_push_and_swing_legs_follow_and_carry_their_weight():
+    """A stance leg carries its own on request."""
+    state, joints, rates = base((0.1, 0.2, 0.3)), STANDS + 0.1, jnp.linspace(-0.5, 0.5, 10)
+    wrench = Wrench(jnp.array([[1.0, 2.0, 0.8 * WEIGHT], [0.0, 0.0, 0.0]]), jnp.zeros((2, 3)))
+    loaded, plain = (
         torques(
-            LegConfig(gravity_compensation=w), base(), STANDS, still, stands, wrench, STANDS, still
+            LegConfig(gravity_compensation=own),
+            state,
+            joints,
+            rates,
+            jnp.array([True, False]),
+            wrench,
+            joints + 0.05,
+            jnp.full(10, 0.2),
         )
-        for w in (False, True)
+        for own in (True, False)
     )
-    weight = carried(STANDS, jnp.asarray(ROBOT.gravity))
-    np.testing.assert_allclose(loaded - plain, weight, atol=1e-9)
+    weight = carried(joints, jnp.asarray(ROBOT.gravity) @ rotation_from_euler(state.euler))
+    pushed = stance(state, joints, wrench)[:5]
+    np.testing.assert_allclose(plain[:5], pushed, atol=1e-9)
+    np.testing.assert_allclose(loaded[:5], pushed + weight[:5], atol=1e-9)
+    pull = 0.05 * np.array(CONFIG.kp) + (0.2 - rates[5:]) * np.array(CONFIG.kd)
+    np.testing.assert_allclose([plain[5:], loaded[5:]], [pull + weight[5:]] * 2, atol=1e-9)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

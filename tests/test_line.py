@@ -71,22 +71,21 @@ def test_a_wrong_word_is_one_line_with_the_nearest_name(monkeypatch, capsys, lin
 
 
 COUNTS = [
-    (kind, field.name)
-    for kind in COMMANDS.values()
+    (name, field.name)
+    for name, kind in COMMANDS.items()
     for field in fields(kind)
     if type(field.default) is int
 ]
 
 
-@pytest.mark.parametrize(("kind", "name"), COUNTS, ids=[f"{k.__name__}.{n}" for k, n in COUNTS])
-def test_every_number_has_an_upper_bound_that_is_told(monkeypatch, capsys, kind, name):
+@pytest.mark.parametrize(("command", "name"), COUNTS)
+def test_every_number_has_an_upper_bound_that_is_told(monkeypatch, capsys, command, name):
     """Nothing is made of the number before: a list of 10**12 jobs would take all memory."""
-    types = {field.name: field.type for field in fields(kind)}
-    required = [field.name for field in fields(kind) if field.default is MISSING]
-    positional = [__file__ if each == "logs" else "." for each in required]
-    words = [kind.__name__.lower(), *positional]
+    kind = {field.name: field for field in fields(COMMANDS[command])}
+    required = [each for each, field in kind.items() if field.default is MISSING]
+    words = [command, *(__file__ if each == "logs" else "." for each in required)]
     line = refused(monkeypatch, capsys, *words, f"--{name.replace('_', '-')}", 10**12)
-    rule = get_args(types[name])[1]
+    rule = get_args(kind[name].type)[1]
     assert f"from {rule.low} to {rule.high}, got 1000000000000" in line
 
 
@@ -149,12 +148,6 @@ SLALOM = Path(__file__).parents[1] / "examples" / "slalom.toml"
 STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
 
 
-def test_a_given_length_is_refused_where_the_trajectory_has_one():
-    args = from_line(["walk", "--traj", str(SLALOM), "--seconds", "4"])
-    with pytest.raises(InputError, match="slalom lasts 6 s, as its file says, got 4"):
-        commands.run(args)
-
-
 @pytest.mark.parametrize("name", ["collect", "search"])
 def test_a_given_folder_is_taken_as_it_is_for_another_robot_too(name):
     robot = load_robot(STRIDER)
@@ -165,45 +158,37 @@ def test_a_given_folder_is_taken_as_it_is_for_another_robot_too(name):
     assert flag_folder(default, "out", robot) == Path(first, "strider", *rest)
 
 
-@pytest.mark.parametrize("given", [("--seeds", "8"), ("--first-seed", "3")])
-@pytest.mark.parametrize("world", ["ideal", "hfs"])
-def test_a_world_of_one_plant_takes_no_number_of_plants(given, world):
-    with pytest.raises(InputError, match=f"{' '.join(given)}: --world {world} is one plant"):
-        commands.run(from_line(["evaluate", "--world", world, *given]))
-
-
-def test_what_was_given_is_noted_through_files_and_latest(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "night.toml").write_text("first-seed = 0\n")
-    args = resolve_latest(from_line(["evaluate", "--config", "night.toml", "--seeds=8"]))
-    assert args.given == {"config", "first_seed", "seeds"}
-    assert args.is_given("first_seed")
-    assert not args.is_given("world")
+@pytest.mark.parametrize(
+    ("line", "fault"),
+    [
+        (f"walk --traj {SLALOM} --seconds 4", "slalom lasts 6 s, as its file says, got 4"),
+        ("evaluate --world ideal --seeds 8", "--seeds 8: --world ideal is one plant"),
+        ("evaluate --world hfs --first-seed 3", "--first-seed 3: --world hfs is one plant"),
+    ],
+)
+def test_what_is_given_beside_what_already_fixes_it_is_refused(line, fault):
+    with pytest.raises(InputError, match=fault):
+        commands.run(from_line(line.split()))
 
 
 # Names that are not text
 
 
-def names_of_files():
-    """Every flag of every command that names a file or a folder."""
-    return [
-        (name, field)
-        for name, kind in COMMANDS.items()
-        for field in fields(kind)
-        if "Path" in str(field.type) or "Source" in str(field.type)
-    ]
+NAMES_OF_FILES = [
+    (name, "" if field.default is MISSING else f"--{field.name}")
+    for name, kind in COMMANDS.items()
+    for field in fields(kind)
+    if "Path" in str(field.type) or "Source" in str(field.type)
+]
 
 
-@pytest.mark.parametrize(
-    ("name", "field"), names_of_files(), ids=lambda x: x if isinstance(x, str) else x.name
-)
+@pytest.mark.parametrize(("name", "flag"), NAMES_OF_FILES)
 @pytest.mark.parametrize("exists", [True, False])
-def test_a_name_that_is_not_utf8_is_refused(monkeypatch, capsys, tmp_path, name, field, exists):
+def test_a_name_that_is_not_utf8_is_refused(monkeypatch, capsys, tmp_path, name, flag, exists):
     wrong = os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.toml")
     if exists:
         Path(wrong).write_text("")
-    flag = [] if field.default is MISSING else [f"--{field.name}"]
-    line = refused(monkeypatch, capsys, name, *flag, wrong)
+    line = refused(monkeypatch, capsys, name, *flag.split(), wrong)
     assert line == f"hector: names must be in UTF-8, got '{tmp_path}/caf\\udce9.toml'"
 
 

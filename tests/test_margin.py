@@ -3,42 +3,30 @@
 from dataclasses import replace
 from pathlib import Path
 
-import jax
 import mujoco
 import numpy as np
 import pytest
+from scipy.linalg import solve_discrete_are
 
 from hector_jax.control.controller import walk_config
-from hector_jax.control.disturbance import NO_DISTURBANCE
-from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
+from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.weights import nominal
 from hector_jax.core.inputs import InputError
-from hector_jax.core.trajectory import State
 from hector_jax.robot.checks import standing_data
 from hector_jax.robot.model import compile_model, load_robot
 from hector_jax.robot.response import (
     DELAY,
     LAG,
     PHASE_MARGIN,
-    largest_gain,
     planned_inertia,
     response,
     swing_frequency,
-    trunk_gain,
 )
-from hector_jax.sim.margin import (
-    Loops,
-    _plan_gain,
-    delay_lines,
-    delay_margin,
-    loops,
-    modes,
-    step_response,
-)
+from hector_jax.sim.margin import Loops, delay_lines, modes
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-HECTOR = load_robot()
-QUADRUPED = load_robot(EXAMPLES / "quadruped" / "robot.toml")
+HECTOR, QUADRUPED = load_robot(), load_robot(EXAMPLES / "quadruped" / "robot.toml")
+RATES = np.geomspace(1.0, 1e3, 20001)  # [rad/s]
 
 
 @pytest.mark.parametrize("robot", [HECTOR, QUADRUPED], ids=lambda r: r.description.name)
@@ -55,27 +43,11 @@ def test_the_mobility_is_that_of_a_robot_whose_stance_feet_do_not_move(robot):
     np.testing.assert_allclose(answer.inertia, M.diagonal()[6:])
 
 
-def test_the_trunk_of_heavy_legs_turns_faster_than_planned():
-    np.testing.assert_array_less(1.0, trunk_gain(HECTOR, response(HECTOR)))
-    roll, pitch, yaw = trunk_gain(QUADRUPED, response(QUADRUPED))
-    assert roll > 3.0 > 1.5 > max(pitch, yaw)  # its feet are far behind and ahead, not aside
-
-
-RATES = np.geomspace(1.0, 1e3, 20001)  # [rad/s]
-
-
 def margin(loop, rates=RATES):
     """Phase margin [rad] of an open loop, a function of s."""
     values = loop(1j * rates)
     crossing = np.flatnonzero(np.abs(values) >= 1.0)[-1]
     return np.pi + np.unwrap(np.angle(values))[crossing]
-
-
-@pytest.mark.parametrize(("corner", "hold"), [(5.0, 0.01), (24.0, 0.001)])
-def test_the_largest_gain_leaves_the_phase_margin(corner, hold):
-    gain, late = largest_gain(corner, hold), DELAY + hold / 2
-    loop = lambda s: gain * (s + corner) / s**2 * np.exp(-late * s) / (1 + LAG * s)  # noqa: E731
-    assert margin(loop) == pytest.approx(PHASE_MARGIN, abs=2e-3)
 
 
 def test_the_fastest_joints_of_a_swing_leg_have_the_phase_margin():
@@ -93,20 +65,11 @@ def test_the_fastest_joints_of_a_swing_leg_have_the_phase_margin():
     assert margin(joints, np.geomspace(5.0, 500.0, 4001)) == pytest.approx(PHASE_MARGIN, abs=0.01)
 
 
-def riccati(angle, rate, step):
-    """Gain of u on (theta, omega) without a cost on u, by iteration."""
-    A, B = np.array([[1.0, step], [0.0, 1.0]]), np.array([[0.0], [step]])
-    P = Q = np.diag([angle, rate])
-    for _ in range(500):
-        K = np.linalg.solve(B.T @ P @ B, B.T @ P @ A)
-        P = Q + A.T @ P @ (A - B @ K)
-    return K[0]
-
-
 def test_the_plan_keeps_the_phase_margin_with_its_share_of_the_inertia():
-    stiffness, damping = riccati(50.0, 1.0, 0.03)
-    inputs = dict(angle=50.0, rate=1.0, step=0.03, tick=0.01)
-    share = planned_inertia(np.array([3.0, 1.0, 4.0]), **inputs)
+    A, B = np.array([[1.0, 0.03], [0.0, 1.0]]), np.array([[0.0], [0.03]])
+    P = solve_discrete_are(A, B, np.diag([50.0, 1.0]), [[1e-9]])  # nearly without a cost on u
+    stiffness, damping = np.linalg.solve(B.T @ P @ B, B.T @ P @ A)[0]
+    share = planned_inertia(np.array([3.0, 1.0, 4.0]), angle=50.0, rate=1.0, step=0.03, tick=0.01)
     assert (share[1], share[0] / share[2]) == (1.0, pytest.approx(4.0 / 3.0))
 
     def loop(s):
@@ -120,44 +83,10 @@ def test_the_plan_turns_its_share_of_the_inertia():
     config = MpcConfig(inertia_share=(0.25, 1.0, 0.49))
     found = config.planned_inertia(np.ones((3, 3)))
     np.testing.assert_allclose(found[0], [0.25, 0.5, 0.35])
-    assert config.planned_inertia(np.ones((3, 3), np.float32)).dtype == np.float32
     with pytest.raises(InputError, match=r"MpcConfig.inertia_share must .* above 0 and at most 1"):
         MpcConfig(inertia_share=(0.0, 1.0, 1.0))
     with pytest.raises(InputError, match="MpcConfig.inertia_share must be 3 numbers"):
         MpcConfig(inertia_share=(1.0,))
-
-
-def test_the_gain_of_the_plan_is_the_derivative_of_the_mpc():
-    config, weights = walk_config(QUADRUPED), nominal(QUADRUPED)
-    answer, N = response(QUADRUPED, [1, 2]), config.mpc.horizon
-    lever = np.tile(answer.lever, (N, 1, 1))
-    still = State(*np.zeros((4, N, 3)))
-    contact = np.tile([False, True, True, False], (N, 1))
-    horizon = Horizon(still, np.zeros((N, 3)), lever, np.zeros((N, 4)), contact)
-
-    def load(x):
-        state = State(*x.reshape(4, 3))
-        numbers = config.mpc.parameters(weights)
-        problem = MpcProblem(QUADRUPED, numbers, state, horizon, NO_DISTURBANCE)
-        wrench, _ = solve_mpc(config.mpc, problem, dt=config.mpc_step, max_contacts=2)
-        return wrench.force[np.array([1, 2])].ravel()
-
-    K = _plan_gain(QUADRUPED, config, weights, answer)
-    np.testing.assert_allclose(-jax.jacfwd(load)(np.zeros(12)), K, rtol=1e-5, atol=1e-6)
-
-
-def joint(kp, kd):
-    """Loops of a joint of unit inertia that is held at rest; nothing is planned."""
-    h = 0.001
-    return Loops(
-        step=np.array([[1.0, h], [0.0, 1.0]]),
-        push=np.array([[h * h], [h]]),
-        base=np.zeros((12, 2)),
-        held=np.zeros((1, 12)),
-        now=-np.array([[kp, kd]]),
-        substeps=10,
-        slowest=1.0,
-    )
 
 
 def test_a_delayed_joint_is_stable_up_to_its_phase_margin():
@@ -165,36 +94,31 @@ def test_a_delayed_joint_is_stable_up_to_its_phase_margin():
     loop = lambda s: (w**2 + w * s) / s**2 / (1 + 0.004 * s)  # noqa: E731
     rate = RATES[np.abs(loop(1j * RATES)) >= 1.0][-1]
     critical = margin(loop) / rate  # the steps of plant and lag are as early as a command is late
-    parts = joint(w**2, w)
+    h = 0.001
+    parts = Loops(  # of a joint of unit inertia that is held at rest; nothing is planned
+        step=np.array([[1.0, h], [0.0, 1.0]]),
+        push=np.array([[h * h], [h]]),
+        base=np.zeros((12, 2)),
+        held=np.zeros((1, 12)),
+        now=-np.array([[w**2, w]]),
+        substeps=10,
+        slowest=1.0,
+    )
     for delay, sign in ((critical - 0.0003, -1), (critical + 0.0003, 1)):
         first = modes(parts, delay, lag=0.004)[0]
         assert np.sign(first.real) == sign
         assert first.imag == pytest.approx(rate, rel=0.03)
 
 
-def loops_of(robot, config):
-    return loops(robot, config, nominal(robot), step_response(robot, config))
-
-
-def test_a_joint_too_stiff_for_its_lag_bears_no_delay():
-    bears, frequency = delay_margin(joint(1e5, 50.0))
-    assert bears is None
-    fastest = np.roots([LAG, 1.0, 50.0, 1e5]).imag.max()  # of s^2 (1 + s LAG) + kd s + kp
-    assert frequency == pytest.approx(fastest / (2 * np.pi), rel=0.05)  # steps of 1 ms
-
-
 def test_the_rules_of_the_gains_bear_the_delay_that_made_the_legs_cycle():
     config, weights = walk_config(QUADRUPED), nominal(QUADRUPED)
-    assert delay_margin(loops_of(QUADRUPED, config)).delay == pytest.approx(DELAY)
     first, remedy = delay_lines(QUADRUPED, config, weights)
-    assert first.startswith("stable up to 5 ms of the motors, with a lag of 6 ms; later, it shakes")
+    stable = "stable up to {} ms of the motors, with a lag of 6 ms; later, it shakes at {}"
+    assert first.startswith(stable.format(5, ""))
     assert remedy.startswith("for 8 ms set legs.kp = [")
     # w = 30 rad/s and the inertia of the whole robot, as robots were proposed before
     legs = replace(config.legs, kp=(45.8, 37.4, 13.2), kd=(1.53, 1.25, 0.439))
     stiff = replace(config, legs=legs, mpc=replace(config.mpc, inertia_share=(1.0, 1.0, 1.0)))
-    found = delay_margin(loops_of(QUADRUPED, stiff))
-    assert found.delay == pytest.approx(0.003)
-    assert found.frequency == pytest.approx(21.0, abs=2.0)  # in MuJoCo the cycle has 20 Hz
     first, remedy = delay_lines(QUADRUPED, stiff, weights)
-    assert first.startswith("stable up to 3 ms of the motors, with a lag of 6 ms; later, it shakes")
+    assert first.startswith(stable.format(3, "22 Hz"))  # in MuJoCo the cycle has 20 Hz
     assert remedy.startswith("for 8 ms set mpc.inertia_share = [0.59, 1.0, 1.0], legs.kp = [")

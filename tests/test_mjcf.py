@@ -6,8 +6,6 @@ from hector_jax.robot.description import MODEL_PATH
 from hector_jax.robot.model import compile_model, describe
 
 TEXT = MODEL_PATH.read_text()
-HEAD = '<mujoco model="hector">'
-ASSET = "<asset>"
 
 
 def swap(old, new, count=-1):
@@ -17,10 +15,6 @@ def swap(old, new, count=-1):
 
 def put(text, after):
     return swap(after, after + text, 1)
-
-
-def without(*marks):
-    return "\n".join(line for line in TEXT.split("\n") if not any(mark in line for mark in marks))
 
 
 DEEP = "<body>" * 5000 + "</body>" * 5000
@@ -35,13 +29,12 @@ BOMB = (
 HOSTILE = {
     "cut": (TEXT[: len(TEXT) // 2], ["malformed XML", "line"]),
     "a list": ("<list/>", ["<list>", "expected <mujoco> or <robot>"]),
-    "urdf of nothing": ('<robot name="hector"/>', ["no joint 'left_hip_yaw'", "joints: none"]),
     "urdf with NaN": (
         '<robot><link name="a"><inertial><origin xyz="0 nan 0"/></inertial></link></robot>',
         ["<origin>", "xyz is '0 nan 0'", "finite"],
     ),
     "entities": (BOMB + TEXT.replace("trunk", "&i;"), ["DOCTYPE"]),
-    "include": (put('<include file="/etc/passwd"/>', HEAD), ["<include> of '/etc/passwd'"]),
+    "include": (put('<include file="/etc/passwd"/>', "<asset>"), ["<include> of '/etc/passwd'"]),
     "huge picture": (
         swap('width="512" height="512"', 'width="99999999" height="99999999"'),
         ["<texture> 'tiles'", "width is '99999999'", "to 8192"],
@@ -53,74 +46,34 @@ HOSTILE = {
         ["2011 bodies, expected at most 2000"],
     ),
     "mass negative": (swap('mass="5.512"', 'mass="-5.512"'), ["mass is '-5.512'", "above 0"]),
-    "gravity NaN": (
-        swap('<option timestep="0.001"', '<option gravity="0 0 nan" timestep="0.001"'),
-        ["<option>", "gravity is '0 0 nan'", "finite"],
-    ),
     "range turned round": (
         swap('range="-2.38 -0.10"', 'range="-0.10 -2.38"'),
         ["<joint> of 'knee'", "range is '-0.10 -2.38'", "lower one first"],
-    ),
-    "nine actuators": (
-        without('<motor name="right_ankle"'),
-        ["joint 'right_ankle' has no torque limit"],
-    ),
-    "a motor at nothing": (
-        swap('joint="left_knee"', 'joint="left_kneee"'),
-        ["drives no joint 'left_kneee'", "did you mean 'left_knee'"],
-    ),
-    "renamed foot": (
-        swap('"left_foot_point"', '"left_fot_point"'),
-        ["no site 'left_foot_point'", "did you mean 'left_fot_point'"],
     ),
     "misspelt attribute": (
         swap('mass="5.512"', 'mas="5.512"'),
         ["MuJoCo refuses", "'mas'", "did you mean 'mass'"],
     ),
-    "a name twice": (swap('name="right_toe"', 'name="left_toe"'), ["MuJoCo refuses", "left_toe"]),
     "no standing pose": (swap('name="standing"', 'name="stand"'), ["no keyframe 'standing'"]),
 }
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A folder with a mesh that is none and a link that leads out of it."""
-    folder = tmp_path_factory.mktemp("outer") / "robot"
-    folder.mkdir()
-    (folder / "shin.stl").write_text("solid nothing")
-    (folder.parent / "a.stl").write_text("solid secret")
-    (folder / "link").symlink_to(folder.parent)
-    return folder
-
-
-def refused(path):
-    with pytest.raises(ValueError, match="robot.xml") as caught:
-        compile_model(describe(path))
-    message = str(caught.value)
-    assert "\n" not in message
-    assert len(message) < 1000
-    return message
-
-
 @pytest.mark.parametrize("name", HOSTILE)
 def test_broken_and_hostile_descriptions_are_refused_in_one_line(
-    name, folder, monkeypatch, tmp_path, capfd
+    name, monkeypatch, tmp_path, capfd
 ):
     text, words = HOSTILE[name]
     monkeypatch.chdir(tmp_path)
-    (folder / "robot.xml").write_text(text)
-    message = refused(folder / "robot.xml")
+    (tmp_path / "robot.xml").write_text(text)
+    with pytest.raises(ValueError, match="robot.xml") as caught:
+        compile_model(describe(tmp_path / "robot.xml"))
+    message = str(caught.value)
+    assert "\n" not in message
+    assert len(message) < 1000
     for word in words:
         assert word in message
-    assert list(tmp_path.iterdir()) == []  # MuJoCo leaves no log
+    assert [path.name for path in tmp_path.iterdir()] == ["robot.xml"]  # MuJoCo leaves no log
     assert capfd.readouterr() == ("", "")
-
-
-def test_fifty_megabytes_are_refused_unread(folder):
-    path = folder / "robot.xml"
-    with path.open("wb") as file:
-        file.truncate(50_000_000)
-    assert "50.0 MB, expected at most 1 MB" in refused(path)
 
 
 @pytest.mark.parametrize(
@@ -132,7 +85,11 @@ def test_fifty_megabytes_are_refused_unread(folder):
         '<texture name="m" type="cube" fileup="../a.png"/>',
     ],
 )
-def test_meshes_and_pictures_are_never_opened(folder, asset):
-    (folder / "robot.xml").write_text(put(asset, ASSET))
+def test_meshes_and_pictures_are_never_opened(tmp_path, asset):
+    folder = tmp_path / "robot"
+    folder.mkdir()
+    (tmp_path / "a.stl").write_text("solid secret")
+    (folder / "link").symlink_to(tmp_path)
+    (folder / "robot.xml").write_text(put(asset, "<asset>"))
     model = compile_model(describe(folder / "robot.xml"))
     assert (model.nmesh, model.nhfield, model.ntex) == (0, 0, 2)

@@ -1,7 +1,6 @@
 """A rollout of all ticks at once is that of one tick after the other."""
 
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,20 +12,12 @@ from model import ROBOT, SHORT, small_effect
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.trajectory import State
-from hector_jax.grfm.effect import last_command
-from hector_jax.robot.model import load_robot
-from hector_jax.tuning.parallel_rollout import _newton, _Step, parallel_rollout
-from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout, rollout_config
+from hector_jax.tuning.parallel_rollout import parallel_rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.tuning.variation import no_variation
 
 EFFECT = small_effect()
 FIELDS = "initial", "state", "reference", "command", "effect", "feet"
-QUADRUPED = load_robot(Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml")
-
-
-def noisy():
-    sigma = State(*(np.full(3, 2e-3) for _ in range(4)))
-    return no_variation()._replace(noise=sigma, delay=np.asarray(0.005), mass=np.asarray(1.05))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -46,9 +37,9 @@ def walked(walk, config, robot, effect, weights, variation=None):
 
 
 def assert_same(config, robot, effect, weights, variation=None):
-    inputs = config, robot, effect, weights, variation
     (expected, gradient), (found, at_once) = (
-        walked(w, *inputs) for w in (rollout, parallel_rollout)
+        walked(walk, config, robot, effect, weights, variation)
+        for walk in (rollout, parallel_rollout)
     )
     assert found.residual.max() < 1e-8
     same = partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9)
@@ -63,29 +54,9 @@ def test_at_once_is_one_after_the_other(weights):
 
 @pytest.mark.slow
 def test_at_once_with_lead_noise_and_delay():
-    assert_same(RolloutConfig(ticks=30, lead=20), ROBOT, EFFECT, nominal(), noisy())
-
-
-@pytest.mark.slow
-def test_at_once_on_four_legs():
-    assert_same(rollout_config(QUADRUPED, 40), QUADRUPED, last_command, nominal(QUADRUPED))
-
-
-@pytest.mark.parametrize("factor", [1.0, float("nan")])
-def test_newton_ends_exact_or_says_that_it_is_not(factor):
-    chaotic = lambda x: 3.9 * x * (1.0 - x)  # noqa: E731
-
-    def linearise(x, tick):
-        return _Step(x, chaotic(x), factor * jnp.diag(3.9 * (1.0 - 2.0 * x)), None)
-
-    carries = np.full((40, 1), 0.3)
-    for i in range(39):
-        carries[i + 1] = chaotic(carries[i])
-    guesses = jnp.full((40, 1), 0.3)
-    steps, converged = _newton(linearise, lambda x: jnp.ones(len(x), bool), guesses, jnp.arange(40))
-    assert bool(converged) == (factor == 1.0)
-    if converged:
-        np.testing.assert_allclose(steps.inputs, carries, atol=1e-4)  # chaos multiplies rounding
+    noise = State(*(np.full(3, 2e-3) for _ in range(4)))
+    other = no_variation()._replace(noise=noise, delay=np.asarray(0.005), mass=np.asarray(1.05))
+    assert_same(RolloutConfig(ticks=30, lead=20), ROBOT, EFFECT, nominal(), other)
 
 
 def test_a_fall_is_seen_at_the_same_tick():

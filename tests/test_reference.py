@@ -50,53 +50,31 @@ def test_the_path_is_the_integral_of_its_velocity(command):
     )
 
 
-def test_the_c_curve_turns_by_pi_in_four_seconds():
-    state = path(named_command("c"), [0.0, 4.0])
-    np.testing.assert_allclose(state.euler[1, 2] - state.euler[0, 2], np.pi)
-    # Half a circle of radius v / omega: its ends are a diameter apart.
-    span = np.linalg.norm(state.position[1] - state.position[0])
-    np.testing.assert_allclose(span, 2 * 0.25 / (0.25 * np.pi))
-
-
-def test_the_s_curve_repeats_after_four_seconds():
-    state = path(named_command("s"), [0.0, 4.0, 8.0, 1.3, 5.3])
-    step = state.position[1] - state.position[0]
-    np.testing.assert_allclose(state.position[2] - state.position[1], step, atol=1e-12)
-    np.testing.assert_allclose(state.position[4] - state.position[3], step, atol=1e-12)
-    np.testing.assert_allclose(state.euler[4], state.euler[3], atol=1e-12)
-
-
-def test_laps_of_a_turning_command_join():
-    state = path(named_command("c"), [3.999999, 4.000001, 15.999999, 16.000001])
-    np.testing.assert_allclose(state.position[0], state.position[1], atol=1e-6)
-    np.testing.assert_allclose(state.position[2], state.position[3], atol=1e-6)
-
-
-def test_a_figure_of_eight_is_two_circles_through_one_point():
-    state = path(named_command("eight"), [0.0, 2.0, 4.0, 6.0, 8.0])
-    np.testing.assert_allclose(state.position[2::2] - state.position[0], 0.0, atol=1e-12)
-    left, right = (state.position[i, :2] - state.position[0, :2] for i in (1, 3))
-    np.testing.assert_allclose(left, -right, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(left), 2 * 0.3 / (0.5 * np.pi))
-    np.testing.assert_allclose(
-        np.asarray(state.euler)[[0, 2, 4], 2], 0.7 + np.array([0, 2, 0]) * np.pi
-    )
-
-
 @pytest.mark.parametrize(
-    ("name", "ahead", "left", "turned"),
-    [("sideways", 0.0, 0.8, 0.0), ("turn", 0.0, 0.0, np.pi), ("stop-and-go", 1.0, 0.0, 0.0)],
+    ("name", "seconds", "ahead", "left", "turned"),
+    [
+        ("straight", 4.0, 2.0, 0.0, 0.0),
+        ("c", 4.0, 0.0, 2.0 / np.pi, np.pi),  # half a circle: its ends are a diameter apart
+        ("c", 8.0, 0.0, 0.0, 2.0 * np.pi),
+        ("s", 2.0, 0.0, 2.0 / np.pi, np.pi),
+        ("s", 4.0, 0.0, 4.0 / np.pi, 0.0),
+        ("s", 8.0, 0.0, 8.0 / np.pi, 0.0),
+        ("sideways", 4.0, 0.0, 0.8, 0.0),
+        ("turn", 4.0, 0.0, 0.0, np.pi),
+        ("eight", 2.0, 0.0, 1.2 / np.pi, np.pi),  # two circles through one point
+        ("eight", 4.0, 0.0, 0.0, 2.0 * np.pi),
+        ("eight", 6.0, 0.0, -1.2 / np.pi, np.pi),
+        ("eight", 8.0, 0.0, 0.0, 0.0),
+        ("stop-and-go", 1.0, 0.5, 0.0, 0.0),
+        ("stop-and-go", 2.0, 0.5, 0.0, 0.0),
+        ("stop-and-go", 4.0, 1.0, 0.0, 0.0),
+    ],
 )
-def test_unseen_commands_lead_where_their_names_say(name, ahead, left, turned):
+def test_commands_lead_where_their_names_say(name, seconds, ahead, left, turned):
     level = Anchor(jnp.array([0.0, 0.0, 0.42]), jnp.array(0.0), jnp.array(0))
-    state = path(named_command(name), [4.0], level)
+    state = path(named_command(name), [seconds], level)
     np.testing.assert_allclose(state.position[0], [ahead, left, 0.42], atol=1e-12)
-    np.testing.assert_allclose(state.euler[0, 2], turned)
-
-
-def test_stop_and_go_stands_in_every_other_second():
-    speed = np.asarray(path(named_command("stop-and-go"), [0.5, 1.5, 2.5, 3.5]).velocity)
-    np.testing.assert_allclose(np.linalg.norm(speed, axis=1), [0.5, 0.0, 0.5, 0.0])
+    np.testing.assert_allclose(state.euler[0, 2], turned, atol=1e-12)
 
 
 def test_unknown_trajectory_is_named():

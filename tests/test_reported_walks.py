@@ -22,7 +22,7 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, no_samples
-from hector_jax.core.tree_file import save_tree
+from hector_jax.core.tree_file import named_leaves, save_tree
 from hector_jax.robot.model import load_robot
 from hector_jax.search.few_walks import Proposal
 from hector_jax.tuning.loss import loss_of_robot
@@ -30,19 +30,11 @@ from hector_jax.walk_tuning import reported_walks, walk_log, walks
 
 SECONDS = 0.1
 SPEEDS = {"ahead": (0.5, 0.0), "aside": (0.0, 0.5), "back": (-0.5, 0.0)}
-TOML = """
-name = "{}"
-[[segment]]
-seconds = 0.1
-v_x = {}
-v_y = {}
-"""
+TOML = 'name = "{}"\n[[segment]]\nseconds = 0.1\nv_x = {}\nv_y = {}\n'
 POINTS = 0.1 * np.random.default_rng(0).standard_normal((9, 19))
 
 
-@pytest.fixture(scope="module")
-def robot():
-    return jax.tree.map(np.asarray, load_robot())
+ROBOT = jax.tree.map(np.asarray, load_robot())
 
 
 def proposed(space, history, *_, **__):
@@ -52,7 +44,7 @@ def proposed(space, history, *_, **__):
 
 
 @pytest.fixture
-def folder(monkeypatch, robot, tmp_path):
+def folder(monkeypatch, tmp_path):
     """A folder for reports of three trajectories, in which nothing is computed for a proposal."""
     pool = HandsOver()
     monkeypatch.setattr(propose, "workers", lambda processes: nullcontext(pool))
@@ -65,7 +57,7 @@ def folder(monkeypatch, robot, tmp_path):
     for name, speed in SPEEDS.items():
         Path(f"{name}.toml").write_text(TOML.format(name, *speed))
     folder = Path("robot")
-    save_tree(folder / "metric.npz", {"matrix": np.eye(18)}, kind="metric", robot=robot)
+    save_tree(folder / "metric.npz", {"matrix": np.eye(18)}, kind="metric", robot=ROBOT)
     return folder
 
 
@@ -77,44 +69,42 @@ def next_walk(folder, names=("ahead", "aside", "back"), start="nominal"):
     propose.run_propose(Propose(folder, json=True, **flags))
 
 
-def drawn(robot, name, error=0.002, fall_at=None, seconds=SECONDS, place=(0.0, 0.0)):
+def drawn(name, error=0.002, fall_at=None):
     """A walk along a trajectory, up to an error [m] to its left."""
-    count = round(seconds * 1000)
+    count = round(SECONDS * 1000)
     t = 1e-3 * np.arange(1, count + 1)[:, None]
     zero = np.zeros((count, 3))
-    start = np.array([*place, robot.standing_height])
-    position = start + t * [*SPEEDS[name], 0.0] + error * np.sin(np.pi * t / seconds) * [0, 1, 0]
+    start = np.array([0.0, 0.0, ROBOT.standing_height])
+    position = start + t * [*SPEEDS[name], 0.0] + error * np.sin(np.pi * t / SECONDS) * [0, 1, 0]
     if fall_at is not None:
         position[round(1000 * fall_at) :, 2] = 0.1
     rng = np.random.default_rng(len(name))
-    empty = no_samples(len(robot.joint_lower), 2)
-    return empty._replace(
+    still = no_samples(len(ROBOT.joint_lower), 2)
+    still = jax.tree.map(lambda x: np.zeros((count, *x.shape[1:])), still)
+    return still._replace(
         period=np.array(1e-3),
         initial=State(np.zeros(3), start, np.zeros(3), np.zeros(3)),
         state=State(zero, position, zero, zero),
-        command=jax.tree.map(lambda x: rng.normal(size=(count, 2, 3)), empty.command),
-        joints=np.zeros((count, 10)),
-        fallen=np.zeros(count, bool),
-        residual=np.zeros(count),
+        command=jax.tree.map(lambda x: rng.normal(size=x.shape), still.command),
     )
 
 
-def plain(robot, name, path=None, **options):
+def plain(name, path=None, **options):
     """Write a log without a card; return its name."""
-    path, log = path or f"{name}.npz", walk_log.log_of(drawn(robot, name, **options))
-    np.savez(path, **walk_log.named_leaves(log))
+    path, log = path or f"{name}.npz", walk_log.log_of(drawn(name, **options))
+    np.savez(path, **named_leaves(log))
     return path
 
 
-def carded(folder, robot, name, path=None, *, weights=None, number=0, card=None, **options):
+def carded(folder, name, path=None, *, weights=None, number=0, card=None, **options):
     """Write a log with the card of `hector walk --out`; return its name."""
     path = path or f"{name}.npz"
-    weights = weights or load_weights(walks.weights_path(folder, number), robot)
+    weights = weights or load_weights(walks.weights_path(folder, number), ROBOT)
     command = load_command(Path(f"{name}.toml")).command
-    made = walk_log.walk_card(name, command, weights=weights, robot=robot, seconds=SECONDS)
+    made = walk_log.walk_card(name, command, weights=weights, robot=ROBOT, seconds=SECONDS)
     about = {"walk": made | (card or {})}
-    walk = drawn(robot, name, **options)
-    save_tree(Path(path), walk, kind="trajectory", robot=robot, about=about)
+    walk = drawn(name, **options)
+    save_tree(Path(path), walk, kind="trajectory", robot=ROBOT, about=about)
     return path
 
 
@@ -141,82 +131,69 @@ def refused(folder, words, *logs, **flags):
     assert content(folder) == before
 
 
-# Whose log it is
-
-
-def test_swapped_logs_with_cards_are_refused(folder, robot):
+def test_logs_that_are_swapped_or_named_otherwise_are_refused(folder):
     next_walk(folder)
-    logs = [carded(folder, robot, name) for name in ("aside", "ahead", "back")]
+    logs = [carded(folder, name) for name in ("aside", "ahead", "back")]
     words = r"^aside.npz: a walk of aside, expected ahead; logs in the order ahead, aside, back, or"
     refused(folder, words, *logs)
-
-
-def test_swapped_logs_without_cards_are_refused(folder, robot):
-    next_walk(folder)
-    logs = [plain(robot, name) for name in ("ahead", "back", "aside")]
+    logs = [plain(name) for name in ("ahead", "back", "aside")]
     words = (
         r"^back.npz: fits back \(horizontal error 0.1 cm\), expected aside \(4.0 cm\); .* aside=b"
     )
     refused(folder, words, *logs)
+    words = "LOGS: unknown trajectory 'ahad'; did you mean 'ahead'"
+    refused(folder, words, "ahad=a.npz", "a.npz", "b.npz")
+    words = "two files for ahead: a.npz and b.npz"
+    refused(folder, words, "ahead=a.npz", "ahead=b.npz", "c.npz")
+    words = "a log of each of ahead, aside, back, got 2 files"
+    refused(folder, words, "ahead=a.npz", "b.npz")
 
 
-@pytest.mark.parametrize(
-    ("logs", "words"),
-    [
-        (("ahad=a.npz", "a.npz", "b.npz"), "LOGS: unknown trajectory 'ahad'; did you mean 'ahead'"),
-        (("ahead=a.npz", "ahead=b.npz", "c.npz"), "two files for ahead: a.npz and b.npz"),
-        (("ahead=a.npz", "b.npz"), "a log of each of ahead, aside, back, got 2 files"),
-    ],
-)
-def test_names_that_do_not_fit_are_refused(folder, logs, words):
-    next_walk(folder)
-    refused(folder, words, *logs)
-
-
-@pytest.mark.parametrize(
-    ("card", "words"),
-    [
+def test_a_log_of_something_else_is_refused(folder):
+    next_walk(folder, ("ahead",))
+    for card, words in (
         ({"robot": "0123456789abcdef"}, "a walk of another robot, or with another gait"),
         ({"seconds": 4.0}, "a walk of 4.0 s, expected 0.1 s"),
         ({"trajectory": "eight", "command": "0"}, "a walk of eight, expected ahead"),
-    ],
-)
-def test_a_log_of_another_robot_or_length_is_refused(folder, robot, card, words):
+        ({"command": "0123456789abcdef"}, "a walk of ahead with another command, expected ahead;"),
+    ):
+        refused(folder, f"^ahead.npz: {words}", carded(folder, "ahead", card=card))
+    own = load_weights(walks.weights_path(folder, 0), ROBOT)
+    higher = own._replace(others={"foot_height": own.others["foot_height"] + 0.01})
+    words = r"^ahead.npz: a walk with other weights than the proposed ones, robot/weights/0.json$"
+    refused(folder, words, carded(folder, "ahead", weights=higher))
+
+
+def test_a_log_or_a_card_that_was_changed_is_refused(folder):
     next_walk(folder, ("ahead",))
-    refused(folder, f"^ahead.npz: {words}", carded(folder, robot, "ahead", card=card))
+    log = Path(carded(folder, "ahead"))
+    data = log.read_bytes()
+    for at in (len(data) // 100, len(data) // 2, len(data) - 20):  # in card, numbers and hash
+        log.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
+        refused(folder, "^ahead.npz: ", str(log))
+    with np.load(carded(folder, "ahead", weights=expert(ROBOT))) as archive:
+        np.savez("edited.npz", **archive)
+    refused(folder, "^edited.npz: cut or changed since it was written", "edited.npz")
 
 
-@pytest.mark.parametrize("at", [0.01, 0.5, -20])  # in the card, in the numbers, in the hash
-def test_a_log_with_a_damaged_card_is_refused(folder, robot, at):
-    next_walk(folder, ("ahead",))
-    log = Path(carded(folder, robot, "ahead"))
-    data = bytearray(log.read_bytes())
-    data[int(at * len(data)) if at > 0 else at] ^= 1
-    log.write_bytes(data)
-    refused(folder, "^ahead.npz: ", str(log))
-
-
-def test_what_a_campaign_cannot_do_now_is_one_line(folder, robot):
+def test_what_a_campaign_cannot_do_now_is_one_line(folder):
     next_walk(folder, ("ahead",))
     with pytest.raises(InputError, match="begun with --traj ahead.toml, got s"):
         propose.run_propose(Propose(folder, ("s",)))
-    log = carded(folder, robot, "ahead")
+    log = carded(folder, "ahead")
     report(folder, log)
     refused(folder, "no walk is waited for", log)
     with pytest.raises(InputError, match="nothing was proposed here"):
         report(Path("other"), log)
 
 
-# What is shown
-
-
-def test_a_fallen_walk_is_reported_as_one(folder, robot, capsys):
+def test_a_fallen_walk_is_reported_as_one(folder, capsys):
     next_walk(folder, ("ahead",))
-    report(folder, plain(robot, "ahead"))
+    report(folder, plain("ahead"))
     next_walk(folder, ("ahead",))
     capsys.readouterr()
     # it fits another trajectory better, as a walk that fell may
-    report(folder, plain(robot, "back", "ahead.npz", fall_at=0.04))
+    report(folder, plain("back", "ahead.npz", fall_at=0.04))
     seen = json.loads((captured := capsys.readouterr()).out)
     assert "fell after 0.04 s" in " ".join(captured.err.split())
     assert (seen["walk"], seen["best"], seen["change"]) == (1, 0, None)
@@ -224,90 +201,28 @@ def test_a_fallen_walk_is_reported_as_one(folder, robot, capsys):
     assert seen["logs"]["ahead"]["seconds"] == pytest.approx(0.04)
 
 
-# Undo
-
-
-def test_a_report_that_is_undone_and_made_again_leaves_the_same_bytes(folder, robot, capsys):
+def test_a_report_that_is_undone_and_made_again_leaves_the_same_bytes(folder, capsys):
     next_walk(folder, ("ahead",))
-    report(folder, plain(robot, "ahead", "0.npz"))
-    next_walk(folder, ("ahead",))
+    report(folder, plain("ahead", "0.npz"))
+    next_walk(folder)
     before = content(folder)
-    report(folder, carded(folder, robot, "ahead", "1.npz", number=1))
+    report(folder, carded(folder, "ahead", "1.npz", number=1))
     after = content(folder)
-    next_walk(folder, ("ahead",))  # which the undo makes void
+    next_walk(folder)  # which the undo makes void
     capsys.readouterr()
     report(folder, undo=True)
     undone = result(capsys)
     assert (undone["walk"], undone["weights"]) == (1, "robot/weights/1.json")
-    (log,) = undone["logs"]
-    assert Path(log).read_bytes() == Path("1.npz").read_bytes()
+    log = Path(*undone["logs"])
+    assert log.read_bytes() == Path("1.npz").read_bytes()
     assert content(folder).items() >= before.items()
-    next_walk(folder, ("ahead",))
+    next_walk(folder)
     assert result(capsys)["walk"] == 1
     report(folder, "1.npz")
     again = content(folder)
     assert again.items() >= after.items()
-    kept = {str(Path(log).relative_to(folder)), "weights/2.json"}
-    assert again.keys() - after.keys() == kept  # and no proposal from the history before
-
-
-STEPS = [(walks, "add_row"), (reported_walks, "write_file"), (Path, "replace"), (Path, "unlink")]
-
-
-@pytest.mark.parametrize("undo", [True, False])
-def test_a_report_or_undo_that_is_killed_leaves_the_old_or_the_new_state(
-    folder, robot, undo, capsys
-):
-    """Killed before and after each of its writes; then the same once more."""
-    next_walk(folder, ("ahead",))
-    report(folder, carded(folder, robot, "ahead", "0.npz"))
-    next_walk(folder, ("ahead",))
-    log = carded(folder, robot, "ahead", "1.npz", number=1)
-    if undo:
-        report(folder, log)
-        next_walk(folder, ("ahead",))
-    call = {"undo": True} if undo else {}
-    logs = () if undo else (log,)
-    record, old, kills, calls = folder / "walks.jsonl", (folder / "walks.jsonl").read_bytes(), 0, []
-
-    def killed(real, at, after):
-        def step(*args, **options):
-            calls.append(real)
-            this = len(calls) == at
-            if this and not after:
-                raise KeyboardInterrupt
-            done = real(*args, **options)
-            if this and after:
-                raise KeyboardInterrupt
-            return done
-
-        return step
-
-    for at, after in product(range(1, 6), (False, True)):
-        with pytest.MonkeyPatch.context() as patch:
-            calls.clear()
-            for module, name in STEPS:
-                patch.setattr(module, name, killed(getattr(module, name), at, after))
-            with suppress(KeyboardInterrupt):
-                report(folder, *logs, **call)
-        kills += len(calls) >= at
-        number = len(rows(folder))
-        waiting = walks.pending(campaign(folder), number)
-        assert Path("1.npz").read_bytes() in content(folder).values() or not undo
-        if record.read_bytes() == old:
-            assert (number, waiting is None) == (2 if undo else 1, False)
-            continue
-        assert (number, waiting is None) == (1 if undo else 2, not undo)
-        if undo:
-            report(folder, log)
-            next_walk(folder)
-        else:
-            report(folder, undo=True)
-        assert record.read_bytes() == old
-    assert kills == 2 * len(calls) > 4
-
-
-# Data
+    # and no proposal from the history before
+    assert again.keys() - after.keys() == {str(log.relative_to(folder)), "weights/2.json"}
 
 
 def campaign(folder):
@@ -318,55 +233,88 @@ def rows(folder):
     return reported_walks.read_reports(HandsOver(), campaign(folder))
 
 
-@pytest.fixture
-def walked(folder, robot):
-    """Two walks of two trajectories were reported."""
-    for number in range(2):
+@pytest.mark.parametrize("undo", [True, False])
+def test_a_report_or_undo_that_is_killed_leaves_the_old_or_the_new_state(folder, undo):
+    """Killed before and after each of its writes; then the same once more."""
+    next_walk(folder, ("ahead",))
+    report(folder, carded(folder, "ahead", "0.npz"))
+    next_walk(folder)
+    log = carded(folder, "ahead", "1.npz", number=1)
+    if undo:
+        report(folder, log)
+        next_walk(folder)
+    reported, undone = ((log,), {}), ((), {"undo": True})
+    (logs, flags), (logs_back, flags_back) = (undone, reported) if undo else (reported, undone)
+    record, kills, calls = folder / "walks.jsonl", 0, []
+    old = record.read_bytes()
+
+    def killed(real, at, after):
+        def step(*args, **options):
+            calls.append(real)
+            this = len(calls) == at
+            if this and not after:
+                raise KeyboardInterrupt
+            done = real(*args, **options)
+            if this:
+                raise KeyboardInterrupt
+            return done
+
+        return step
+
+    writes = (walks, "add_row"), (reported_walks, "write_file"), (Path, "replace"), (Path, "unlink")
+    for at, after in product(range(1, 6), (False, True)):
+        with pytest.MonkeyPatch.context() as patch:
+            calls.clear()
+            for module, name in writes:
+                patch.setattr(module, name, killed(getattr(module, name), at, after))
+            with suppress(KeyboardInterrupt):
+                report(folder, *logs, **flags)
+        kills += len(calls) >= at
+        number = len(rows(folder))
+        waits = walks.pending(campaign(folder), number) is not None
+        assert Path("1.npz").read_bytes() in content(folder).values() or not undo
+        if record.read_bytes() == old:
+            assert (number, waits) == (2 if undo else 1, True)
+            continue
+        assert (number, waits) == (1 if undo else 2, undo)
+        report(folder, *logs_back, **flags_back)
+        if undo:
+            next_walk(folder)
+        assert record.read_bytes() == old
+    assert kills == 2 * len(calls) > 4
+
+
+def test_reports_outlive_the_code_that_took_them_and_are_scored_by_the_present_loss(
+    folder, monkeypatch
+):
+    for number in (1, 2):
         next_walk(folder, ("ahead", "aside"))
-        error = 0.003 * (1 + number)
-        report(folder, *(plain(robot, name, error=error) for name in ("ahead", "aside")))
-    return folder
-
-
-def test_reports_are_scored_by_the_present_loss(walked, monkeypatch):
-    before, files = rows(walked), content(walked)
+        report(folder, *(plain(name, error=0.003 * number) for name in ("ahead", "aside")))
+    before, files = rows(folder), content(folder)
+    for module in ("store.cache", "walk_tuning.walks"):
+        monkeypatch.setattr(f"hector_jax.{module}.code_hash", lambda *_: "of other code")
+    monkeypatch.setattr("hector_jax.core.environment.version", lambda package: "99")
+    for old, new in zip(before, rows(folder), strict=True):
+        jax.tree.map(np.testing.assert_array_equal, old, new)
 
     def heavier(description):
         return loss_of_robot(replace(description, loss=(("L_pos", 1e9),)))
 
     instead(monkeypatch, propose.tunings, "loss_of_robot", heavier)
-    after, one = rows(walked), campaign(walked)
-    for number, (old, new) in enumerate(zip(before, after, strict=True)):
-        scores = walks.evaluate_logs(HandsOver(), one, number)
-        np.testing.assert_array_equal(new.losses, [score.loss for score, _ in scores])
+    after = rows(folder)
+    for old, new in zip(before, after, strict=True):
         assert np.all(new.losses > 2.0 * old.losses)
         np.testing.assert_array_equal(new.point, old.point)
     assert (before[1].predicted, after[1].predicted) == (-0.1, None)  # it was of the other loss
-    assert content(walked) == files
-    next_walk(walked)  # and it goes on
+    assert content(folder) == files
+    next_walk(folder)  # and it goes on
 
 
-def test_reports_outlive_the_code_and_packages_that_took_them(walked, monkeypatch):
-    before, files = rows(walked), content(walked)
-    for module in ("store.cache", "walk_tuning.walks"):
-        monkeypatch.setattr(f"hector_jax.{module}.code_hash", lambda *_: "of other code")
-    monkeypatch.setattr("hector_jax.core.environment.version", lambda package: "99")
-    for old, new in zip(before, rows(walked), strict=True):
-        jax.tree.map(np.testing.assert_array_equal, old, new)
-    assert content(walked) == files
-
-
-# From end to end
-
-
-def test_the_log_of_a_walk_with_the_proposed_file_is_taken(folder, robot, capsys):
+def test_the_log_of_a_walk_with_the_proposed_file_is_taken(folder, capsys):
     """From weights with unlike feet, which are tied, and with numbers beside Q and R."""
-    start = nominal(robot)
-    uneven = start.R.force * [[1.0], [2.0 / 3.0]]
-    others = {"footstep_width": np.array(0.07)}
-    save_weights(
-        Path("uneven.json"), start._replace(R=start.R._replace(force=uneven), others=others)
-    )
+    start = nominal(ROBOT)._replace(others={"footstep_width": np.array(0.07)})
+    uneven = start.R._replace(force=start.R.force * [[1.0], [2.0 / 3.0]])
+    save_weights(Path("uneven.json"), start._replace(R=uneven))
 
     def walk(weights, **flags):
         evaluate.run_walk(Walk(traj="ahead.toml", weights=weights, out=Path("log.npz"), **flags))
@@ -375,46 +323,9 @@ def test_the_log_of_a_walk_with_the_proposed_file_is_taken(folder, robot, capsys
     next_walk(folder, ("ahead",), start="uneven.json")
     first = result(capsys)["weights"]
     refused(folder, f"other weights than the proposed ones, {first}", walk("uneven.json"))
-    stiffer = (description := robot.description).path.read_text().replace("kp = [60", "kp = [61")
-    Path("stiffer.toml").write_text(stiffer)
-    Path("hector.xml").write_bytes(description.model.read_bytes())
-    other = walk(first, robot=Path("stiffer.toml"))
-    refused(folder, "a walk of another robot, or with another gait", other)
     report(folder, walk(first))
     next_walk(folder)  # the other flags are those of the folder
     second = result(capsys)["weights"]
     refused(folder, f"other weights than the proposed ones, {second}", walk(first))
     report(folder, f"ahead={walk(second, world='standin', seed=3)}")
     assert result(capsys)["walk"] == 1
-
-
-def test_a_log_of_other_weights_is_refused(folder, robot):
-    next_walk(folder, ("ahead",))
-    log = carded(folder, robot, "ahead", weights=expert(robot))
-    words = r"^ahead.npz: a walk with other weights than the proposed ones, robot/weights/0.json$"
-    refused(folder, words, log)
-    own = load_weights(walks.weights_path(folder, 0), robot)
-    higher = own._replace(others={"foot_height": own.others["foot_height"] + 0.01})
-    refused(folder, words, carded(folder, robot, "ahead", weights=higher))
-
-
-def test_a_log_of_the_set_before_is_refused(folder, robot):
-    next_walk(folder, ("ahead",))
-    log = carded(folder, robot, "ahead")
-    report(folder, log)
-    next_walk(folder, ("ahead",))
-    refused(folder, "other weights than the proposed ones, robot/weights/1.json", log)
-
-
-def test_a_log_of_another_command_of_the_same_name_is_refused(folder, robot):
-    next_walk(folder, ("ahead",))
-    log = carded(folder, robot, "ahead", card={"command": "0123456789abcdef"})
-    refused(folder, "a walk of ahead with another command, expected ahead;", log)
-
-
-def test_a_card_that_was_edited_is_refused(folder, robot):
-    next_walk(folder, ("ahead",))
-    log = carded(folder, robot, "ahead", weights=expert(robot))
-    with np.load(log) as archive:
-        np.savez("edited.npz", **archive)
-    refused(folder, "^edited.npz: cut or changed since it was written", "edited.npz")

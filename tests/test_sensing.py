@@ -23,17 +23,6 @@ def sensed(robot, row, raw, floor, foot_of_geom):
     return sensing.base_state(robot, reading, jnp.zeros(())), wrench, points, ground.touches
 
 
-@jax.jit
-def foot_points(robot, row):
-    reading = sensing.unpack_reading(row)
-    return reading, sensing.foot_points(robot, reading)
-
-
-@jax.jit
-def yaw_after(row, before):
-    return sensing.base_state(ROBOT, sensing.unpack_reading(row), before).euler[2]
-
-
 def flat_reading(world, data):
     return np.concatenate([data.qpos, data.qvel, [0.0]])[sensing.coordinates(world)]
 
@@ -77,20 +66,11 @@ def test_at_rest_the_ground_carries_the_weight_inside_the_feet(plant):
     wanted = (momentum(world, data) - before) / 0.001 + [0.0, 0.0, weight]
     assert np.linalg.norm(force.sum(axis=0) - wanted) <= 0.01 * weight  # m (a + g) of all links
     assert force[:, 2].sum() == pytest.approx(weight, rel=0.005)
-    assert np.abs(force[:, :2].sum(axis=0)).max() < 0.02 * weight  # the loose robot still sways
     ahead, aside = -moment[:, 1] / force[:, 2], moment[:, 0] / force[:, 2]
     assert (-ROBOT.heel <= ahead).all()
     assert (ahead <= ROBOT.toe).all()
     assert np.abs(aside).max() < 1e-3
-    assert not touches.floor
-    assert not touches.legs
-
-
-def test_in_flight_there_is_no_wrench():
-    world, data, row = stand(ideal(), height=0.5, steps=3)
-    _, wrench, _, _ = sense(world, data, row)
-    assert not np.any(wrench.force)
-    assert not np.any(wrench.moment)
+    assert not any(touches)
 
 
 def test_the_wrench_is_the_sum_of_mujocos_contact_forces():
@@ -110,10 +90,7 @@ def test_the_wrench_is_the_sum_of_mujocos_contact_forces():
 
 
 def test_base_state_is_that_of_a_point_fixed_to_the_trunk():
-    world = build_world(ideal())
-    data = mujoco.MjData(world.model)
-    rng = np.random.default_rng(3)
-    data.qpos[:] = standing_qpos(world, ROBOT.standing_joints, 1.0)
+    (world, data, _), rng = stand(ideal(), steps=0), np.random.default_rng(3)
     data.qpos[3:7] = rng.normal(size=4)
     data.qpos[3:7] /= np.linalg.norm(data.qpos[3:7])
     data.qvel[:6] = rng.normal(size=6)
@@ -131,14 +108,11 @@ def test_base_state_is_that_of_a_point_fixed_to_the_trunk():
     )
 
 
-def test_foot_points_and_joints_count_the_backlash():
-    world = build_world(hfs())
-    data = mujoco.MjData(world.model)
-    data.qpos[:] = standing_qpos(world, ROBOT.standing_joints, 1.0)
+def test_foot_points_count_the_backlash():
+    world, data, _ = stand(hfs(), steps=0)
     data.qpos[world.model.jnt_qposadr[world.slack]] = np.linspace(-0.005, 0.005, 10)
     mujoco.mj_kinematics(world.model, data)
-    reading, points = foot_points(ROBOT, flat_reading(world, data))
-    np.testing.assert_array_equal(reading.slack, np.linspace(-0.005, 0.005, 10))
+    points = sense(world, data, flat_reading(world, data))[2]
     for foot, ankle in enumerate(world.joint_dof[[4, 9]]):
         body = world.model.dof_bodyid[ankle]
         expected = data.xpos[body] + data.xmat[body].reshape(3, 3) @ ROBOT.foot_point[foot]
@@ -146,43 +120,33 @@ def test_foot_points_and_joints_count_the_backlash():
 
 
 def test_yaw_goes_on_past_half_a_turn():
-    row = np.zeros(43)
-    yaws = np.linspace(0.0, 9.0, 40)
-    before = jnp.zeros(())
-    for yaw in yaws:
+    yaw_of = jax.jit(lambda reading, yaw: sensing.base_state(ROBOT, reading, yaw).euler[2])
+    row, before = np.zeros(43), jnp.zeros(())
+    for yaw in np.linspace(0.0, 9.0, 40):
         row[3:7] = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
-        before = yaw_after(row, before)
+        before = yaw_of(sensing.unpack_reading(row), before)
         assert before == pytest.approx(yaw, abs=1e-9)
 
 
-def test_a_knee_on_the_floor_is_no_foot():
-    world = build_world(ideal())
-    data = mujoco.MjData(world.model)
-    data.qpos[:] = standing_qpos(world, ROBOT.standing_joints, 0.2)
+@pytest.mark.parametrize(
+    ("height", "inwards", "floor", "legs"),
+    [(0.2, 0.0, True, False), (1.0, 0.0, False, False), (1.0, 0.3, False, True)],
+    ids=["knees on the floor", "in the air", "legs crossed"],
+)
+def test_what_touches_is_told_and_only_feet_on_the_floor_have_a_wrench(
+    height, inwards, floor, legs
+):
+    world, data, _ = stand(ideal(), steps=0)
+    roll = inwards * np.array([0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    data.qpos[:] = standing_qpos(world, ROBOT.standing_joints + roll, height)
     mujoco.mj_forward(world.model, data)
-    touches = sense(world, data, flat_reading(world, data))[3]
-    assert touches.floor
-    assert not touches.legs
+    _, wrench, _, touches = sense(world, data, flat_reading(world, data))
+    assert (touches.floor, touches.legs) == (floor, legs)
+    assert floor or not (np.any(wrench.force) or np.any(wrench.moment))
 
 
-def test_legs_that_cross_touch_each_other_and_not_the_floor():
-    world = build_world(ideal())
-    data = mujoco.MjData(world.model)
-    for inwards in (0.0, 0.3):
-        roll = inwards * np.array([0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-        data.qpos[:] = standing_qpos(world, ROBOT.standing_joints + roll, 1.0)
-        mujoco.mj_forward(world.model, data)
-        _, wrench, _, touches = sense(world, data, flat_reading(world, data))
-        assert touches.legs == (inwards > 0.0)
-        assert not touches.floor
-        assert not np.any(wrench.force)
-
-
-def test_a_known_state_has_no_errors():
+def test_errors_have_their_stated_sizes_and_a_known_state_has_none():
     assert not sensing.draw_errors(truth(), 10, 0, 10, 20).any()
-
-
-def test_errors_have_their_stated_sizes():
     estimator = standin(0).estimator
     runs = np.stack([sensing.draw_errors(estimator, 10, seed, 100, 4000) for seed in range(60)])
     start = runs[:, :100]
@@ -194,10 +158,7 @@ def test_errors_have_their_stated_sizes():
 
 
 def test_the_controller_is_told_the_truth_plus_the_error():
-    world = build_world(ideal())
-    data = mujoco.MjData(world.model)
-    data.qpos[:] = standing_qpos(world, ROBOT.standing_joints, 1.0)
-    reading = jnp.asarray(flat_reading(world, data))
+    reading = jnp.asarray(stand(ideal(), steps=0)[2])
     true, _ = sensing.measure(ROBOT, reading, jnp.zeros(()), sensing.no_error(ROBOT))
     error = jnp.linspace(0.01, 0.22, 22)
     told, yaw = sensing.measure(ROBOT, reading, jnp.zeros(()), error)
@@ -210,11 +171,7 @@ def test_the_controller_is_told_the_truth_plus_the_error():
 
 def test_more_contacts_than_there_is_room_for_are_a_part_on_the_floor(monkeypatch):
     world, data, row = stand(ideal(), height=-0.001, steps=1)
-    assert data.ncon > 1
     monkeypatch.setattr(sensing, "CONTACTS", data.ncon - 1)
-    contacts = sensing.empty_contacts(1)
-    sensing.read_contacts(data, contacts, 0)
-    one = jax.tree.map(lambda x: x[0], contacts)
-    _, wrench, _, touches = sensed(ROBOT, row, one, world.floor, world.foot_of_geom)
+    _, wrench, _, touches = sense(world, data, row)
     assert touches.floor
     assert not np.any(wrench.force)

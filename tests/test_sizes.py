@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pretend import pretend_walk
-from scenes import Level, SceneConfig, make_scenes
 
 from hector_jax.core.settings import from_table, to_table
 from hector_jax.grfm.jobs import draw_jobs
@@ -76,16 +75,6 @@ def test_pushes_of_the_data_have_the_size_of_the_robot():
         np.testing.assert_allclose(one.imperfections.joint_friction, 3.0 * friction)
 
 
-def test_scenes_push_and_load_as_much_as_the_robot_is_large():
-    config = SceneConfig(forces=(50.0,), frictions=(0.4,), phases=1)
-    scenes = make_scenes(config, "straight", sizes=SIZES)
-    force = scenes[Level("push", 250.0)][0].push.force
-    np.testing.assert_allclose(np.linalg.norm(force), 250.0)
-    (loaded,) = scenes[Level("payload", "8 kg from the start")]
-    assert loaded.changes[0].payload == 8.0
-    np.testing.assert_allclose(loaded.changes[0].payload_at, (0.0, 0.0, 1.5 * 0.124))
-
-
 # What the TOML says
 
 
@@ -103,24 +92,18 @@ def test_sizes_and_loss_are_sections_of_the_robots_file(tmp_path):
 # The loss
 
 
-def weighed(**alphas):
-    robot = load_robot()
-    return robot._replace(description=replace(robot.description, loss=tuple(alphas.items())))
-
-
 def test_a_robots_loss_has_the_weights_of_its_file():
-    assert tune_config(load_robot()).loss == PAPER_LOSS
-    loss = tune_config(weighed(L_ctrl=0.1, position=3e4)).loss
+    robot = load_robot()
+    assert tune_config(robot).loss == PAPER_LOSS
+    weighed = replace(robot.description, loss=(("L_ctrl", 0.1), ("position", 3e4)))
+    loss = tune_config(robot._replace(description=weighed)).loss
     assert [term.weight for term in loss] == [1e5, 3e4, 0.1]
 
 
 def test_a_fall_from_higher_up_costs_more():
     walk = pretend_walk(error=0.0, seconds=1.0)
-    fallen = walk._replace(fallen=np.ones_like(walk.fallen))
-    taller = fallen.reference._replace(position=fallen.reference.position * [1, 1, 2.0])
-    low, high = (
-        float(losses(PAPER_LOSS, one)["L_pos"])
-        for one in (fallen, fallen._replace(reference=taller))
-    )
-    assert low == pytest.approx(1000 * 0.5**2)
-    assert high == pytest.approx(1000 * 1.0**2)
+    for height in (1.0, 2.0):
+        reference = walk.reference._replace(position=walk.reference.position * [1, 1, height])
+        fallen = walk._replace(fallen=np.ones_like(walk.fallen), reference=reference)
+        found = float(losses(PAPER_LOSS, fallen)["L_pos"])
+        assert found == pytest.approx(1000 * (0.5 * height) ** 2)

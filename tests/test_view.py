@@ -18,10 +18,10 @@ from hector_jax.control.weights import expert, nominal, weights_to_vector
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core import inputs
 from hector_jax.core.files import write_json
-from hector_jax.report import pictures, view
+from hector_jax.report import pictures
 from hector_jax.report.motion import motion
 from hector_jax.report.view import ViewedWalk, arrows
-from hector_jax.robot.model import compile_model, describe, load_robot
+from hector_jax.robot.model import load_robot
 from hector_jax.store import folder as runs
 from hector_jax.store.cache import robot_hash
 
@@ -31,25 +31,18 @@ def robot():
     return load_robot()
 
 
-@pytest.fixture(scope="module")
-def model():
-    return compile_model(describe())
-
-
 def viewed(seed=0, **kwargs):
-    """A pretended walk; without turning, its yaw frame is the world frame."""
+    """A pretended walk."""
     walk = pretend_walk(seed, **kwargs)
     return ViewedWalk(walk, {"commanded": walk.command, "measured": walk.effect})
 
 
-def pretend_run(folder, iterations=12, weights=()):
+def pretend_run(folder):
     """The folder of a run, as far as a page reads it."""
     loss = {"euler": 1e5, "position": 2e5}
     flags, body = as_table(Tune(data=folder / "data")), robot_hash(load_robot())
     write_json(folder / "config.json", {"flags": flags, "robot": body, "tune": {"loss": loss}})
-    write_metrics(folder, iterations)
-    for name in weights:
-        save_weights(folder / "weights" / f"{name}.json", expert())
+    write_metrics(folder, 12)
     return folder
 
 
@@ -67,36 +60,23 @@ def test_an_arrow_has_the_direction_of_its_force_and_the_scale_of_its_robot(robo
     """The weight is drawn five sixths of the standing height long, whatever the robot's size."""
     robot = robot._replace(mass=size**3 * robot.mass, standing_height=size * robot.standing_height)
     weight, height = float(robot.mass * robot.gravity[2]), float(robot.standing_height)
-    one = viewed(seconds=0.5)
+    one = viewed(seconds=2.0, turn=np.pi / 4)
+    ahead = np.zeros((200, 2, 3))
+    ahead[..., 0] = weight  # in the yaw frame
+    one.ground["predicted"] = one.walk.effect._replace(force=ahead)
     moved = motion(robot, *one)
-    ends = arrows(moved, "force", "measured")
-    expected = one.walk.effect.force / weight * 5 / 6 * height
-    found = ends[:, :, 1] - ends[:, :, 0]
-    np.testing.assert_allclose(found[..., 2], expected[..., 2])
-    np.testing.assert_allclose(found, expected, atol=0.01)  # the pretended yaw sways a little
-    ends_of_moments = arrows(moved, "moment", "measured")
-    np.testing.assert_allclose(
-        (ends_of_moments[:, :, 1] - ends_of_moments[:, :, 0])[..., 2],
-        one.walk.effect.moment[..., 2] / weight * 5 / 6 / 0.24,  # the weight at 0.24 heights
-    )
-    # beside the foot, outwards
-    aside = ends[:, :, 0, 1] - one.walk.feet[..., 1]
-    assert (aside[:, 0] > 0.05).all()
-    assert (aside[:, 1] < -0.05).all()
 
+    def drawn(what, source):
+        ends = arrows(moved, what, source)
+        return ends[:, :, 1] - ends[:, :, 0]
 
-def test_wrenches_of_the_yaw_frame_are_turned_into_the_world(robot):
-    walk = pretend_walk(seconds=2.0, turn=np.pi / 4)
-    force = np.zeros((200, 2, 3))
-    force[..., 0] = weight = float(robot.mass * robot.gravity[2])  # ahead
-    found = motion(robot, walk, {"predicted": walk.effect._replace(force=force)})
-    yaw = walk.state.euler[-2, 2]
-    ahead = [np.cos(yaw), np.sin(yaw), 0.0]
-    there = found.wrenches["predicted"].force[-1, 0]
-    np.testing.assert_allclose(there / weight, ahead, atol=1e-9)
-    ends = arrows(found, "force", "predicted")[-1, 0]
-    drawn = (ends[1] - ends[0]) / float(robot.standing_height)
-    np.testing.assert_allclose(drawn, 5 / 6 * np.array(ahead), atol=1e-9)
+    effect, yaw = one.walk.effect, one.walk.state.euler[-2, 2]
+    there = 5 / 6 * height * np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    np.testing.assert_allclose(drawn("force", "predicted")[-1, 0], there, atol=1e-9)
+    up = effect.force[..., 2] / weight * 5 / 6 * height
+    np.testing.assert_allclose(drawn("force", "measured")[..., 2], up)
+    up = effect.moment[..., 2] / weight * 5 / 6 / 0.24  # the weight at 0.24 heights
+    np.testing.assert_allclose(drawn("moment", "measured")[..., 2], up)
 
 
 def test_both_walks_stand_on_one_reference_wherever_they_began(robot):
@@ -109,45 +89,31 @@ def test_both_walks_stand_on_one_reference_wherever_they_began(robot):
     np.testing.assert_allclose(ends, arrows(found, "force", "commanded"), atol=1e-9)
 
 
-def test_metrics_are_read_back_as_they_were_written(tmp_path):
-    write_metrics(tmp_path, 6, refused=(3,))
-    found = runs.read_histories(tmp_path)
-    assert list(found) == ["without", "with"]
-    assert [i.accepted for i in found["with"]] == [k != 3 for k in range(7)]
-    written = (tmp_path / "metrics.jsonl").read_text()
+def test_metrics_of_a_run_that_goes_on_are_read_and_its_newest_weights_taken(tmp_path):
+    run = pretend_run(tmp_path)
+    write_metrics(run, 6, refused=(3,))
+    found = runs.read_histories(run)
     again = [runs.as_line(name, i) for name, history in found.items() for i in history]
-    assert "".join(again) == written
+    assert "".join(again) == (run / "metrics.jsonl").read_text()
+    assert [i.accepted for i in found["with"]] == [k != 3 for k in range(7)]
     curve = runs.loss_curves(found)["with"]
     assert np.isnan(curve[3])
     assert curve[6] < curve[0]
-
-
-def test_a_run_that_goes_on_lends_its_newest_weights(tmp_path):
-    run = pretend_run(tmp_path)
-    weights, told = runs.weights_of(run, "with")
-    np.testing.assert_array_equal(weights_to_vector(weights), weights_to_vector(nominal()))
-    assert told == "with at iteration 12, so far"
-    save_weights(run / "weights" / "with.json", expert())
-    weights, told = runs.weights_of(run, "with")
-    np.testing.assert_array_equal(weights_to_vector(weights), weights_to_vector(expert()))
-    assert told == "with"
-
-
-def refused(monkeypatch, capsys, *arguments):
-    monkeypatch.setattr(sys, "argv", ["hector", "view", *map(str, arguments)])
-    assert main() == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    return err.splitlines()[-1]
+    for expected, words in ((nominal(), "with at iteration 6, so far"), (expert(), "with")):
+        weights, told = runs.weights_of(run, "with")
+        np.testing.assert_array_equal(weights_to_vector(weights), weights_to_vector(expected))
+        assert told == words
+        save_weights(run / "weights" / "with.json", expert())
 
 
 def test_what_is_no_run_is_refused_in_one_line(monkeypatch, capsys, tmp_path):
-    line = refused(monkeypatch, capsys, tmp_path, "--headless")
-    assert line.startswith(f"hector: {tmp_path}/config.json: cannot read a file of a run of")
-    (tmp_path / "config.json").write_text("[]")
-    assert "config.json: expected a JSON object" in refused(
-        monkeypatch, capsys, tmp_path, "--headless"
-    )
+    monkeypatch.setattr(sys, "argv", ["hector", "view", str(tmp_path), "--headless"])
+    for fault in (": cannot read a file of a run of", ": expected a JSON object"):
+        assert main() == 2
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert err.splitlines()[-1].startswith(f"hector: {tmp_path}/config.json{fault}")
+        (tmp_path / "config.json").write_text("[]")
 
 
 def test_headless_writes_film_and_pictures_instead(monkeypatch, capsys, tmp_path):
@@ -167,67 +133,41 @@ def test_headless_writes_film_and_pictures_instead(monkeypatch, capsys, tmp_path
     assert {file.name for file in out.iterdir()} == drawn
 
 
-@pytest.fixture
-def page(robot, model, tmp_path):
-    viser = pytest.importorskip("viser", reason="viser, of the extra view, is not installed")
-    run = pretend_run(tmp_path)
-    walks = {"before": viewed(0, seconds=1.0), "after": viewed(1, seconds=1.0, fall_at=0.6)}
-    motions = {name: motion(robot, *one) for name, one in walks.items()}
-    server = viser.ViserServer("127.0.0.1", 0, verbose=False)
-    yield view.Page(server, motions, model, run, "a story"), run, motions
-    server.stop()
-
-
-def _until(seconds, look):
-    """What `look` finds, asked again until it finds something."""
+def until(seconds, seen):
+    """Ask again until it is seen."""
     end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        found = look()
-        if found is not None:
-            return found
+    while not seen():
+        assert time.monotonic() < end, f"not seen within {seconds} s"
         time.sleep(1.0)
-    raise AssertionError(f"not seen within {seconds} s")
 
 
-def _drawn(picture):
-    """The scene where both robots are in it: their colours, on what is not one plain plane."""
+def shows_both(picture):
+    """Whether both robots are in the scene: their colours, on what is not one plain plane."""
     scene = picture[:, :800].astype(int)
     red, green, blue = scene[..., 0], scene[..., 1], scene[..., 2]
     before = (blue > green + 40) & (green > red + 20)
     after = (green > red + 30) & (green > blue)
-    seen = before.sum() > 50 and after.sum() > 50 and scene.std() > 15.0
-    return scene if seen else None
+    return before.sum() > 50 and after.sum() > 50 and scene.std() > 15.0
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
 def test_a_browser_shows_the_run_until_it_is_interrupted(tmp_path):
     pytest.importorskip("viser", reason="viser, of the extra view, is not installed")
-    run = pretend_run(tmp_path / "run", weights=["with"])
-    words = [
-        sys.executable,
-        "-m",
-        "hector_jax.cli.main",
-        "view",
-        run,
-        "--seconds",
-        "0.5",
-        "--port",
-        "0",
-        "--sets",  # blue and green
-        "expert",
-        "with",
-    ]
+    run = pretend_run(tmp_path / "run")
+    save_weights(run / "weights" / "with.json", expert())
+    words = [sys.executable, "-m", "hector_jax.cli.main", "view", run]
+    words += "--seconds 0.5 --port 0 --sets expert with".split()  # blue and green
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as page:
         try:
             told = next(line for line in page.stderr if line.startswith("open http"))
             with opened(told.split()[1], tmp_path / "profile") as tab:
-                _until(300, lambda: _drawn(tab.picture()))
+                until(300, lambda: shows_both(tab.picture()))
                 words = tab.text()
                 for expected in ("before: expert", "after: with", "Pause", "L on the model"):
                     assert expected in words
                 write_metrics(run, 20)  # the run goes on
-                _until(60, lambda: True if "with: iteration 20" in tab.text() else None)
+                until(60, lambda: "with: iteration 20" in tab.text())
         finally:
             page.send_signal(signal.SIGINT)
         out, err = page.communicate(timeout=60)

@@ -186,56 +186,6 @@ def test_the_numbers_of_the_legs_are_tuned_by_walks_alone(robot):
         run_folder.trajectories(Tune(tune=("kp", "foot_height")), robot)
 
 
-@pytest.fixture(scope="module")
-def arrays(robot, tmp_path_factory):
-    path = walked(robot, nominal(robot), tmp_path_factory.mktemp("log") / "whole.npz")
-    with np.load(path) as archive:
-        return {name: archive[name] for name in archive.files if name != "card"}
-
-
-def test_a_plain_archive_with_the_least_entries_is_a_log(robot, arrays, tmp_path):
-    least = {n: x for n, x in arrays.items() if n.split(".")[0] in ("initial", "state", "command")}
-    np.savez(tmp_path / "least.npz", joints=arrays["joints"], **least)
-    log = walk_log.read_log(tmp_path / "least.npz", robot, SECONDS)
-    assert log.joints.shape == (50, 10)
-    assert not log.fallen.any()
-    # a log that ends early is that of a fall
-    seen = walk_log.evaluate_log(
-        CONFIG, robot, AHEAD, walk_log.read_log(tmp_path / "least.npz", robot, SECONDS)
-    )
-    assert np.isfinite(seen[0].loss)
-    short = walk_log.read_log(tmp_path / "least.npz", robot, 0.07)
-    assert short.fallen.tolist() == [False] * 50 + [True] * 20
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"joints": np.zeros((50, 9))}, r"joints must have shape \(50, 10\), got \(50, 9\)"),
-        ({"state.euler": np.full((50, 3), np.nan)}, "state.euler must hold finite numbers"),
-        ({"command.force": None}, "command.force is missing"),
-        ({"joints": np.zeros((51, 10))}, "expected 50 samples of joints, got 51"),
-    ],
-)
-def test_a_log_that_is_none_is_refused_in_one_line(robot, arrays, tmp_path, change, words):
-    changed = {n: x for n, x in (arrays | change).items() if x is not None}
-    np.savez(tmp_path / "log.npz", **changed)
-    with pytest.raises(InputError, match=words):
-        walk_log.read_log(tmp_path / "log.npz", robot, SECONDS)
-
-
-def _cut(arrays, path):
-    np.savez(path, **arrays)
-    path.write_bytes(path.read_bytes()[:-400])
-
-
-@pytest.mark.parametrize("write", [lambda arrays, path: path.write_text("no log"), _cut])
-def test_what_is_no_whole_archive_is_refused(robot, arrays, tmp_path, write):
-    write(arrays, tmp_path / "log.npz")
-    with pytest.raises(InputError, match=r"not a log \(\.npz\)"):
-        walk_log.read_log(tmp_path / "log.npz", robot, SECONDS)
-
-
 def test_the_reference_of_a_log_is_that_of_its_walk(robot):
     walked = walk(CONFIG.rollout.walk, robot, Job(nominal(robot), AHEAD, hfs(), SECONDS))
     seen, _ = walk_log.evaluate_log(CONFIG, robot, AHEAD, walk_log.log_of(walked))

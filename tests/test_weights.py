@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from lib import sample_weights
 
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.mpc import MpcConfig
@@ -38,15 +37,12 @@ def test_each_name_stands_where_its_weight_is():
 
 @pytest.mark.parametrize("shape", [(24,), (3, 24), (2, 5, 24)])
 def test_vector_and_weights_are_the_same_numbers(shape):
-    vector = np.random.default_rng(0).uniform(size=shape)
+    vector = np.random.default_rng(0).uniform(size=shape).astype(np.float32)
     weights = vector_to_weights(jnp.asarray(vector))
     assert weights.R.force.shape == (*shape[:-1], 2, 3)
-    np.testing.assert_array_equal(weights_to_vector(weights), vector)
-
-
-def test_the_vector_keeps_the_dtype():
-    vector = jnp.ones(24, jnp.float32)
-    assert weights_to_vector(vector_to_weights(vector)).dtype == jnp.float32
+    back = weights_to_vector(weights)
+    np.testing.assert_array_equal(back, vector)
+    assert back.dtype == np.float32
 
 
 @pytest.mark.parametrize("weights", [nominal, expert])
@@ -64,11 +60,6 @@ def test_the_expert_is_stricter_than_nominal_on_pose_and_dearer_in_effort():
     np.testing.assert_allclose(ratio[6:12], 1.0)
     np.testing.assert_allclose(ratio[12:18], [1, 1, 5] * 2)
     np.testing.assert_allclose(ratio[18:], 10.0)
-
-
-def test_named_weights_are_fresh_each_time():
-    nominal().Q.euler[0] = -1.0
-    assert nominal().Q.euler[0] > 0.0
 
 
 def test_the_feet_share_their_weights_in_every_direction():
@@ -120,12 +111,3 @@ def test_each_number_beside_the_weights_has_its_box_and_its_default_inside():
         assert (TUNABLES[name].lower, TUNABLES[name].upper) == (low, high), name
         default = np.asarray(TUNABLES[name].read(parameters))
         assert ((low <= default) & (default <= high)).all(), name
-
-
-def test_drawn_weights_are_spread_evenly_up_and_down_within_the_factor():
-    middle = weights_to_vector(nominal())
-    drawn = [weights_to_vector(w) / middle for w in sample_weights(nominal(), 2.0, 10)]
-    shares = np.log2(np.asarray(drawn))
-    assert -1.0 <= shares.min() < -0.9
-    assert 0.9 < shares.max() <= 1.0
-    assert abs(shares.mean()) < 0.1

@@ -19,12 +19,12 @@ def test_the_wheel_walks_in_an_environment_of_its_own(tmp_path):
     """Built from a copy without git, installed without network; packages are the running ones."""
     pytest.importorskip("hatchling")
 
+    # nothing of the checkout may be found by the programs
+    known = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+
     def call(*words, **more):
-        # nothing of the checkout may be found by the programs
-        known = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-        done = subprocess.run(
-            [str(word) for word in words], capture_output=True, text=True, env=known, **more
-        )
+        words = [str(word) for word in words]
+        done = subprocess.run(words, capture_output=True, text=True, env=known, **more)
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
@@ -35,19 +35,17 @@ def test_the_wheel_walks_in_an_environment_of_its_own(tmp_path):
         shutil.copy(ROOT / name, source)
     home.mkdir()
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check")
-    call(*pip, "wheel", "--no-deps", "--no-index", "--no-build-isolation", "-w", wheels, source)
+    alone = ("--no-deps", "--no-index")
+    call(*pip, "wheel", *alone, "--no-build-isolation", "-w", wheels, source)
     (wheel,) = wheels.iterdir()
     call(sys.executable, "-m", "venv", "--without-pip", tmp_path / "venv")
     python = tmp_path / "venv" / "bin" / "python"
     packages = call(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))").strip()
-    # A path in a .pth file is searched, but its own .pth files, the editable install, are not read;
-    # packages that came with paths of their own, as Pinocchio's, need these.
+    # a path in a .pth file is searched, but its own .pth files, the editable install, are not read
     running = sysconfig.get_path("purelib")
     paths = [running, *(path for path in sys.path if path.startswith(f"{running}/"))]
     (Path(packages) / "running.pth").write_text("\n".join(paths) + "\n")
-    call(
-        *pip, "--python", python, "install", "--no-deps", "--no-index", "--ignore-installed", wheel
-    )
+    call(*pip, "--python", python, "install", *alone, "--ignore-installed", wheel)
     shutil.rmtree(source)
 
     hector = python.parent / "hector"

@@ -11,7 +11,7 @@ import logging
 import sys
 import warnings
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 
 from hector_jax.core.inputs import InputError, outside_packages
 
@@ -28,7 +28,7 @@ except InputError as error:
 
 def main() -> int:
     """Run the console script and return its exit code."""
-    return exit_code("hector", lambda: _run(sys.argv[1:]))
+    return exit_code("hector", partial(_run, sys.argv[1:]))
 
 
 def _run(words: Sequence[str]) -> None:

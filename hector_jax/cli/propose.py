@@ -126,7 +126,8 @@ def _check_logs(
     proposed = {n: walk_log.walk_card(n, x, *walked) for n, x in campaign.commands.items()}
     result, before = {}, [p for n in range(number) for p in walks.log_paths(campaign, n)]
     for name, file in files.items():
-        log = walk_log.read_log(file, robot, campaign.seconds)
+        tick = campaign.config.rollout.walk.gait.tick
+        log = walk_log.read_log(file, robot, campaign.seconds, tick)
         tracked = {
             n: walk_log.tracking_errors(campaign.config, robot, x, log)
             for n, x in campaign.commands.items()

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from functools import partial
+from itertools import repeat
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, NamedTuple
@@ -329,7 +330,7 @@ def _prepare_tuning(config: TuneConfig, robot: Robot, start: Weights, problem: P
     """Compile the programs of a tuning, so that its first call need not."""
     scenario, *_ = rollouts_of(config, robot, problem)
     weights = difftune.init(config, start).start
-    evaluation = _evaluation_job(config, scenario, weights)
+    evaluation = jax.device_get(difftune.tune_step(config, scenario, weights))
     if not problem.draws:
         difftune.check_start(StepStatus(int(step_status(config, evaluation))), evaluation)
     _matrix_job(config, scenario, weights)
@@ -363,14 +364,11 @@ def compile_programs(
         not_the_weights, config.rollout.walk, jax.tree.map(np.asarray, robot), job
     )
     plain = config, start, Problem((trajectory.command,), None)
-    preparing = [
-        pool.submit(_prepare_tuning, settings, robot, weights, problem)
-        for settings, weights, problem in (plain, *others)
-    ]
+    configs, starts, problems = zip(plain, *others, strict=True)
+    preparing = pool.map(_prepare_tuning, configs, repeat(robot), starts, problems)
     meanwhile()
     with bar("compiling, once on a machine") as report_progress:
-        for done, future in enumerate((walking, *preparing)):
-            report_progress(done, 1 + len(preparing), "")
-            future.result()
-        report_progress(1 + len(preparing), 1 + len(preparing), "")
+        report_progress(0, len(configs), "")
+        for done, _ in enumerate(preparing, 1):
+            report_progress(done, len(configs), "")
     return walking.result()

@@ -5,9 +5,8 @@ s' H s with H = J' (d2L / dw2) J, where w are the states and commands of the wal
 derivative. A direction of H with a small eigenvalue changes neither walk nor loss.
 """
 
-from collections.abc import Callable, Sequence
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +19,7 @@ from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.tuning.evaluate import Walk
 from hector_jax.tuning.loss import Loss, losses, total
-from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
+from hector_jax.tuning.rollout import RolloutConfig, rollout
 
 _NAMED = 0.35  # a direction is named by the weights of at least this share of its largest entry
 _FLAT = 1e-3  # a direction that changes the loss by less than this share does not matter
@@ -59,43 +58,28 @@ class Determined(NamedTuple):
 
 def gauss_newton(
     config: RolloutConfig,
-    scenario: Scenario,
+    scenario: Any,
     weights: Weights,
     loss: Loss,
     *,
     walk: Walk = rollout,
     others: tuple[str, ...] = (),
 ) -> Float[Array, "n n"]:
-    """Return the Gauss-Newton matrix of the loss of a rollout.
+    """Compute the Gauss-Newton matrix of the loss of a rollout.
 
     Args:
-        config, scenario: of the rollout.
+        config, scenario, walk: of the rollout, see `evaluate`.
         weights: the point of evaluation.
         loss: terms and their weights.
-        walk: `rollout` or `parallel_rollout`.
         others: names of numbers beside Q and R.
 
     Returns:
         The matrix in the n coordinates of `parameters.stepped`.
     """
-    return gauss_newton_of(partial(walk, config, scenario), weights, loss, others)
-
-
-gauss_newton_jit = jax.jit(gauss_newton, static_argnums=0, static_argnames=("walk", "others"))
-"""`gauss_newton`, compiled once per rollout and set of terms."""
-
-
-def gauss_newton_of(
-    walk: Callable[[Weights], Trajectory],
-    weights: Weights,
-    loss: Loss,
-    others: tuple[str, ...] = (),
-) -> Float[Array, "n n"]:
-    """Compute the Gauss-Newton matrix of the loss of the walk of a weight set."""
     zero = jnp.zeros(len(step_names(weights, others)))
 
     def moved(steps: Float[Array, " n"]) -> tuple[tuple[State, Wrench], Trajectory]:
-        trajectory = walk(stepped(weights, steps, others))
+        trajectory = walk(config, scenario, stepped(weights, steps, others))
         return (trajectory.state, trajectory.command), trajectory
 
     def tangent_of(direction: Float[Array, " n"]) -> tuple:
@@ -103,6 +87,10 @@ def gauss_newton_of(
 
     _, tangents, trajectory = jax.vmap(tangent_of, out_axes=(None, 0, None))(jnp.eye(len(zero)))
     return matrix_of_walk(loss, trajectory, tangents)
+
+
+gauss_newton_jit = jax.jit(gauss_newton, static_argnums=0, static_argnames=("walk", "others"))
+"""`gauss_newton`, compiled once per rollout and set of terms."""
 
 
 def matrix_of_walk(

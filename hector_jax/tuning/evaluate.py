@@ -1,7 +1,6 @@
 """Loss of a weight set on the model and its gradient, by reverse mode (Eq. 9, 11)."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +15,8 @@ from hector_jax.core.trajectory import Trajectory
 from hector_jax.tuning.loss import Loss, Terms, losses, total, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 
-Walk = Callable[[RolloutConfig, Scenario, Weights], Trajectory]
+Walk = Callable[[RolloutConfig, Any, Weights], Trajectory]
+"""`rollout`, or another walk on the model by its settings, what it walks, and weights."""
 
 
 class Evaluation(NamedTuple):
@@ -30,23 +30,9 @@ class Evaluation(NamedTuple):
     residual: Float[Array, "*batch"]
 
 
-def evaluation(walk: Callable[[Weights], Trajectory], weights: Weights, loss: Loss) -> Evaluation:
-    """Compute the loss of the walk of a weight set and its gradient by the weights."""
-
-    def objective(weights: Weights) -> tuple[Array, tuple]:
-        trajectory = walk(weights)
-        terms = losses(loss, trajectory)
-        checks = jnp.mean(1.0 * trajectory.fallen), jnp.max(trajectory.residual)
-        return total(loss, terms), (terms, *checks)
-
-    value_and_grad = jax.value_and_grad(objective, has_aux=True)
-    (value, (terms, fallen, residual)), gradient = value_and_grad(weights)
-    return Evaluation(value, terms, gradient, fallen, residual)
-
-
 def evaluate(
     config: RolloutConfig,
-    scenario: Scenario,
+    scenario: Any,
     weights: Weights,
     loss: Loss,
     *,
@@ -55,13 +41,23 @@ def evaluate(
     """Compute the loss of a weight set on the model and its gradient, in one program.
 
     Args:
-        config, scenario, weights: see `rollout`.
+        config, weights: see `rollout`.
+        scenario: what is walked: a `Scenario`, or a `Grounding` by `grounded_rollout`.
         loss: terms and their weights.
-        walk: `rollout`, or `parallel_rollout` on a GPU with few rollouts.
+        walk: `rollout`; `parallel_rollout` on a GPU with few rollouts; or `grounded_rollout`.
 
     Source: Eq. 9, 11.
     """
-    return evaluation(partial(walk, config, scenario), weights, loss)
+
+    def objective(weights: Weights) -> tuple[Array, tuple]:
+        trajectory = walk(config, scenario, weights)
+        terms = losses(loss, trajectory)
+        checks = jnp.mean(1.0 * trajectory.fallen), jnp.max(trajectory.residual)
+        return total(loss, terms), (terms, *checks)
+
+    value_and_grad = jax.value_and_grad(objective, has_aux=True)
+    (value, (terms, fallen, residual)), gradient = value_and_grad(weights)
+    return Evaluation(value, terms, gradient, fallen, residual)
 
 
 evaluate_jit = jax.jit(evaluate, static_argnums=0, static_argnames="walk")

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from hector_jax import qp
 from hector_jax.control.controller import measured_feet
@@ -22,9 +22,6 @@ from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
 from hector_jax.robot.model import Robot
-from hector_jax.tuning.curvature import gauss_newton_of
-from hector_jax.tuning.evaluate import Evaluation, evaluation
-from hector_jax.tuning.loss import Loss
 from hector_jax.tuning.rollout import (
     Carry,
     RolloutConfig,
@@ -134,30 +131,3 @@ def grounded_rollout(config: RolloutConfig, grounding: Grounding, weights: Weigh
     ticks = tick + jnp.arange(len(residuals.feet.yaw))
     _, samples = jax.lax.scan(step, start, (residuals, ticks))
     return samples._replace(initial=start.state, period=jnp.asarray(config.walk.gait.tick))
-
-
-@partial(jax.jit, static_argnums=0)
-def evaluate_grounded(
-    config: RolloutConfig, grounding: Grounding, weights: Weights, loss: Loss
-) -> Evaluation:
-    """Compute the loss of a grounded rollout and its gradient, as `evaluate` of a plain rollout.
-
-    Args:
-        config, grounding, weights: see `grounded_rollout`.
-        loss: terms and their weights; changes of the command count after the first tick.
-
-    Source: Eq. 9, 11.
-    """
-    return evaluation(partial(grounded_rollout, config, grounding), weights, loss)
-
-
-@partial(jax.jit, static_argnames=("config", "others"))
-def grounded_matrix(
-    config: RolloutConfig,
-    grounding: Grounding,
-    weights: Weights,
-    loss: Loss,
-    others: tuple[str, ...] = (),
-) -> Float[Array, "n n"]:
-    """Compute the Gauss-Newton matrix of a grounded rollout; see `curvature.gauss_newton`."""
-    return gauss_newton_of(partial(grounded_rollout, config, grounding), weights, loss, others)

@@ -1,7 +1,6 @@
 """Logs of walks of this simulator or of a robot: their entries, loading, card and loss."""
 
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,14 +8,14 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hector_jax.control.reference import Command, anchor_at, reference_at
+from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights
 from hector_jax.core.inputs import InputError, one_line
 from hector_jax.core.settings import convert
-from hector_jax.core.trajectory import SOLVED, State, Trajectory, Wrench, has_fallen, no_samples
-from hector_jax.core.tree_file import named_leaves, read_card, tree_hash
-from hector_jax.robot.mjcf import TIME_STEP
+from hector_jax.core.trajectory import SOLVED, State, Trajectory, Wrench, no_samples
+from hector_jax.core.tree_file import read_card, tree_hash
 from hector_jax.robot.model import Robot
+from hector_jax.sim.walk_file import read_walk, reference_of
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import loss_of
 from hector_jax.walk_tuning.campaign import walker_hash
@@ -25,6 +24,7 @@ from hector_jax.walk_tuning.campaign import walker_hash
 class Log(NamedTuple):
     """Measurements of a walk: the entries of these names in the file of `hector walk --out`."""
 
+    period: Float[Any, ""]  # [s] between samples
     initial: State  # at t = 0, when the command begins
     state: State  # (T, 3) each, at the end of each sample
     joints: Float[Any, "T joints"]  # [rad] leg by leg
@@ -41,7 +41,7 @@ class LogScore(NamedTuple):
 
 
 ScoredLog = tuple[LogScore, Log]
-"""The score of a log of 1 ms, and the log at the plan interval."""
+"""The score of a log, and the log at the plan interval."""
 
 
 def log_of(trajectory: Trajectory) -> Log:
@@ -49,57 +49,18 @@ def log_of(trajectory: Trajectory) -> Log:
     return Log(*(getattr(trajectory, name) for name in Log._fields))
 
 
-def read_log(path: Path, robot: Robot, seconds: float) -> Log:
-    """Read the log of a walk: an .npz with the entries of `Log`, as `hector walk --out` writes it.
-
-    `period`, `fallen` and `residual` may be left out. A log that ends early counts as a fall from
-    its end on.
-
-    Args:
-        path: the file.
-        robot: the robot that walked.
-        seconds: expected length of the walk; samples are of 1 ms.
-
-    Raises:
-        InputError: one line naming the file and the entry that is missing, of another shape, or not
-            of finite numbers; or it is not a log of 1 ms.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files if name != "card"}
-    except Exception as error:  # a foreign archive can fail in any way
-        raise InputError(f"{path}: not a log (.npz): {one_line(error)}") from None
-    wanted, joints, feet = round(seconds / TIME_STEP), len(robot.joint_lower), len(robot.foot_point)
-    count = next(iter(arrays.get("joints", np.zeros(())).shape), 0)
-    if not 1 <= count <= wanted:
-        raise InputError(f"{path}: expected {wanted} samples of joints, got {count}")
-    empty = log_of(no_samples(joints, feet))
-    log_shapes = {n: np.shape(leaf) for n, leaf in named_leaves(empty).items()}
-    # where the empty log has no samples, this one has `count`
-    shapes = {"period": (), **{n: tuple(x or count for x in s) for n, s in log_shapes.items()}}
-    defaults = {"fallen": np.zeros(count, bool), "residual": np.zeros(count)}
-    arrays = {"period": np.array(TIME_STEP), **defaults, **arrays}
-    for name, shape in shapes.items():
-        if name not in arrays:
-            raise InputError(f"{path}: {name} is missing; expected {', '.join(shapes)}")
-        if (got := arrays[name].shape) != shape:
-            raise InputError(f"{path}: {name} must have shape {shape}, got {got}")
-        if arrays[name].dtype.kind not in "biuf" or not np.isfinite(arrays[name]).all():
-            raise InputError(f"{path}: {name} must hold finite numbers")
-    if not np.isclose(arrays["period"], TIME_STEP, rtol=1e-6):
-        raise InputError(f"{path}: samples must be of {TIME_STEP} s, got {arrays['period']}")
-    numbers = [arrays[name].astype(float) for name in log_shapes]
-    log = jax.tree.unflatten(jax.tree.structure(empty), numbers)
-    log = _on_samples(log, np.minimum(np.arange(wanted), count - 1))
-    down = np.asarray(has_fallen(log.state, *robot.description.limits))
-    fallen = np.maximum.accumulate(down | log.fallen.astype(bool))
-    return log._replace(fallen=fallen | (np.arange(wanted) >= count))
+def read_log(path: Path, robot: Robot, seconds: float, tick: float) -> Log:
+    """Read the log of a walk; see `read_walk`."""
+    return log_of(read_walk(path, robot, seconds, tick)[0])
 
 
-def _on_samples(log: Log, rows: Any) -> Log:
-    """Return the log on some of its samples."""
-    samples = jax.tree.map(lambda x: x[rows], log._replace(initial=None))
-    return samples._replace(initial=log.initial)
+def _at_ticks(log: Log, tick: float) -> Log:
+    """Return the log at the end of each tick [s]."""
+    stride = round(tick / float(log.period))
+    samples = log._replace(period=None, initial=None)
+    return jax.tree.map(lambda x: x[stride - 1 :: stride], samples)._replace(
+        period=np.asarray(tick), initial=log.initial
+    )
 
 
 def walk_card(
@@ -153,27 +114,19 @@ def check_fit(path: Path, name: str, tracked: Mapping[str, Mapping[str, Any]]) -
         )
 
 
-def trajectory_of(log: Log, period: float) -> Trajectory:
-    """Return the trajectory of a log sampled every `period` [s]; entries not in a log are empty."""
+def trajectory_of(log: Log) -> Trajectory:
+    """Return the trajectory of a log; entries not in a log are empty."""
     empty = no_samples(log.joints.shape[1], log.command.force.shape[1])
-    return empty._replace(period=np.asarray(period), **log._asdict())
-
-
-@partial(jax.jit, static_argnums=0)
-def _reference_of(tick: float, robot: Robot, command: Command, log: Log) -> State:
-    """Return the reference of a log of 1 ms; `tick` is that of the gait [s]."""
-    ticks = (np.arange(len(log.fallen)) + 1.0) / round(tick / TIME_STEP)
-    anchor = anchor_at(robot, log.initial, 0)
-    return jax.vmap(lambda t: reference_at(tick, command, anchor, t))(ticks)
+    return empty._replace(**log._asdict())
 
 
 def tracking_errors(config: TuneConfig, robot: Robot, command: Command, log: Log) -> dict[str, Any]:
-    """Return how a log of 1 ms tracks a command, as JSON values in SI units.
+    """Return how a log tracks a command, as JSON values in SI units.
 
     RMS errors and `seconds` are up to a fall, of one sample at least.
     """
     count, tick = max(np.sum(~log.fallen), 1), config.rollout.walk.gait.tick
-    reference = _reference_of(tick, robot, command, log)
+    reference = reference_of(tick, robot, command, log)
     euler, position = (
         np.sqrt(np.mean((np.asarray(x) - y)[:count] ** 2, axis=0)).tolist()
         for x, y in zip(log.state[:2], reference[:2], strict=True)
@@ -183,19 +136,19 @@ def tracking_errors(config: TuneConfig, robot: Robot, command: Command, log: Log
         "rms_euler": euler,  # roll, pitch, yaw
         "initial_position": log.initial.position.tolist(),
         "initial_yaw": float(log.initial.euler[2]),
-        "seconds": float(count * TIME_STEP),
+        "seconds": float(count * log.period),
         "fell": bool(log.fallen.any()),
     }
 
 
 def evaluate_log(config: TuneConfig, robot: Robot, command: Command, log: Log) -> ScoredLog:
-    """Return the score of a log of 1 ms against its command, and the log at the plan interval.
+    """Return the score of a log against its command, and the log at the plan interval.
 
     Source: Eq. 11.
     """
     tick = config.rollout.walk.gait.tick
-    stride, reference = round(tick / TIME_STEP), _reference_of(tick, robot, command, log)
-    loss = float(loss_of(config.loss, trajectory_of(log, TIME_STEP)._replace(reference=reference)))
+    reference = reference_of(tick, robot, command, log)
+    loss = float(loss_of(config.loss, trajectory_of(log)._replace(reference=reference)))
     min_height, max_tilt = robot.description.limits
     upright = ~log.fallen
     tilt = np.abs(log.state.euler[upright, :2]).max(initial=0.0) / max_tilt
@@ -203,4 +156,4 @@ def evaluate_log(config: TuneConfig, robot: Robot, command: Command, log: Log) -
     sunk = (height - log.state.position[upright, 2].min(initial=height)) / (height - min_height)
     failed = log.fallen.any() or not log.residual.max() <= SOLVED
     score = LogScore(np.inf, 1.0) if failed else LogScore(loss, float(max(tilt, sunk)))
-    return score, _on_samples(log, slice(stride - 1, None, stride))
+    return score, _at_ticks(log, tick)

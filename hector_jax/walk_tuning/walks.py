@@ -43,9 +43,10 @@ from hector_jax.sim.loop import Job
 from hector_jax.store import tunings
 from hector_jax.store.cache import content_key, robot_hash
 from hector_jax.store.setup import Setup
+from hector_jax.tuning.curvature import gauss_newton_jit
 from hector_jax.tuning.difftune import TuneConfig, step_status
-from hector_jax.tuning.evaluate import Evaluation
-from hector_jax.tuning.grounded import Grounding, evaluate_grounded, fit_grounding, grounded_matrix
+from hector_jax.tuning.evaluate import Evaluation, evaluate_jit
+from hector_jax.tuning.grounded import Grounding, fit_grounding, grounded_rollout
 from hector_jax.tuning.rollout import Scenario
 from hector_jax.tuning.status import StepStatus
 from hector_jax.walk_tuning.campaign import (
@@ -96,7 +97,7 @@ def _ground_job(campaign: Campaign, weights: Weights, command: Command, log: Log
     """Ground the plain rigid body on a walk, unless the campaign has no use for residuals."""
     config, robot = campaign.config.rollout, campaign.robot
     effect = network.effect_of(None, config.walk)
-    trajectory = trajectory_of(log, config.walk.gait.tick)
+    trajectory = trajectory_of(log)
     scenario = Scenario(robot, command, standing_anchor(robot), effect)
     grounding = fit_grounding(config, scenario, weights, trajectory)
     if campaign.model == "plain":
@@ -105,13 +106,13 @@ def _ground_job(campaign: Campaign, weights: Weights, command: Command, log: Log
 
 
 def _evaluate_job(config: TuneConfig, grounding: Grounding, weights: Weights) -> Evaluation:
-    return jax.device_get(evaluate_grounded(config.rollout, grounding, weights, config.loss))
+    inputs = config.rollout, grounding, weights, config.loss
+    return jax.device_get(evaluate_jit(*inputs, walk=grounded_rollout))
 
 
 def _matrix_job(config: TuneConfig, grounding: Grounding, weights: Weights) -> Any:
-    return np.asarray(
-        grounded_matrix(config.rollout, grounding, weights, config.loss, config.others)
-    )
+    inputs = config.rollout, grounding, weights, config.loss
+    return np.asarray(gauss_newton_jit(*inputs, walk=grounded_rollout, others=config.others))
 
 
 def row_of(proposal: Proposal, cases: Sequence[ScoredLog]) -> Row:
@@ -255,7 +256,8 @@ def log_paths(campaign: Campaign, number: int) -> list[Path]:
 def evaluate_logs(pool: Executor, campaign: Campaign, number: int) -> list[ScoredLog]:
     """Evaluate the logs of a walk that was reported; see `evaluate_log`."""
     paths, commands = log_paths(campaign, number), [command for _, command in campaign.cases]
-    logs = [read_log(path, campaign.robot, campaign.seconds) for path in paths]
+    tick = campaign.config.rollout.walk.gait.tick
+    logs = [read_log(path, campaign.robot, campaign.seconds, tick) for path in paths]
     inputs = repeat(campaign.config), repeat(campaign.robot), commands, logs
     return list(pool.map(evaluate_log, *inputs))
 

@@ -1,0 +1,113 @@
+"""Read a walk from a file that any controller and simulator can write.
+
+An .npz with entries named like those of a `Trajectory`, such as `state.euler` (T, 3). Needed are
+`initial`, `state`, `command` and `joints`; of the others `period` is 1 ms by default, `effect` the
+command, and all else zero: no fall, solved plans.
+"""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hector_jax.control.reference import Command, anchor_at, reference_at
+from hector_jax.core.inputs import InputError, one_line
+from hector_jax.core.trajectory import State, Trajectory, has_fallen, no_samples
+from hector_jax.core.tree_file import named_leaves
+from hector_jax.robot.mjcf import TIME_STEP
+from hector_jax.robot.model import Robot
+
+_NEEDED = ("initial.", "state.", "command.", "joints")
+
+
+def read_walk(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Trajectory, str]:
+    """Read a walk. One that ends early, or whose state is no number from some time on, fell then.
+
+    Args:
+        path: the file.
+        robot: the robot that walked.
+        seconds: expected length.
+        tick: that of the gait [s], a whole number of periods.
+
+    Returns:
+        The walk (numpy) without reference; from its end on, samples repeat the last one and are
+        marked `fallen`. And how it ended, "fell after 1.20 s", or nothing.
+
+    Raises:
+        InputError: one line naming the file and the entry that is missing, of another shape, or not
+            of finite numbers; or its period is no part of a tick.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files if name != "card"}
+    except Exception as error:  # a foreign archive can fail in any way
+        raise InputError(f"{path}: not a log (.npz): {one_line(error)}") from None
+    empty = no_samples(len(robot.joint_lower), len(robot.foot_point))
+    arrays = {"period": np.array(TIME_STEP)} | arrays
+    if not _divides(period := arrays["period"], tick):
+        text = f"must be {tick} s, the gait's tick, divided by a whole number"
+        raise InputError(f"{path}: period {text}, got {period}")
+    wanted = round(seconds / float(period))
+    count = next(iter(arrays.get("joints", np.zeros(())).shape), 0)
+    if not 1 <= count <= wanted:
+        raise InputError(f"{path}: expected {wanted} samples of joints, got {count}")
+    walk = _checked(path, arrays, empty, count)
+    finite = np.all([np.isfinite(x).all(axis=1) for x in walk.state], axis=0)
+    valid = count if finite.all() else int(np.argmin(finite))
+    for name, x in named_leaves(walk).items():
+        if not np.isfinite(x[: max(valid, 1)] if np.ndim(x) and len(x) == count else x).all():
+            raise InputError(f"{path}: {name} must hold finite numbers")
+    rows = np.minimum(np.arange(wanted), valid - 1)
+    samples = jax.tree.map(lambda x: x[rows], walk._replace(period=None, initial=None))
+    down = np.asarray(has_fallen(samples.state, *robot.description.limits))
+    fallen = np.maximum.accumulate(down | samples.fallen) | (np.arange(wanted) >= valid)
+    upright = float(period) * (wanted if not fallen.any() else int(np.argmax(fallen)))
+    end = f"fell after {upright:.2f} s" if fallen.any() else ""
+    if end and valid < count:
+        end = f"its state is no number from {upright:.2f} s on, which counts as a fall"
+    elif end and upright == float(period) * count:
+        end = f"its log ends after {upright:.2f} of {seconds:g} s, which counts as a fall"
+    walk = samples._replace(period=np.asarray(period, float), initial=walk.initial, fallen=fallen)
+    return walk, end
+
+
+def _divides(period: np.ndarray, tick: float) -> bool:
+    if period.shape != () or period.dtype.kind not in "iuf" or not 0.0 < period <= 1.001 * tick:
+        return False
+    return abs(tick / float(period) - round(tick / float(period))) < 1e-3
+
+
+def _checked(path: Path, arrays: dict[str, Any], empty: Trajectory, count: int) -> Trajectory:
+    """Return the walk of the entries of a file, of which those that may be absent are filled in."""
+    found = {}
+    for name, like in named_leaves(empty).items():
+        shape = tuple(x or count for x in np.shape(like))  # the empty walk has no samples
+        default = found.get(name.replace("effect", "command"), np.zeros(shape))
+        if name not in arrays and name.startswith(_NEEDED):
+            names = ", ".join(n for n in named_leaves(empty) if n.startswith(_NEEDED))
+            raise InputError(f"{path}: {name} is missing; expected {names}")
+        found[name] = default if name.startswith("reference.") else arrays.get(name, default)
+        if (got := found[name].shape) != shape:
+            raise InputError(f"{path}: {name} must have shape {shape}, got {got}")
+        if found[name].dtype.kind not in "biuf":
+            raise InputError(f"{path}: {name} must hold finite numbers")
+        flags = name in ("contact", "fallen", "legs_touch")
+        found[name] = found[name].astype(bool if flags else float)
+    return jax.tree.unflatten(jax.tree.structure(empty), list(found.values()))
+
+
+@partial(jax.jit, static_argnums=0)
+def reference_of(tick: float, robot: Robot, command: Command, walk: Any) -> State:
+    """Return the reference of a walk.
+
+    Args:
+        tick: that of the gait [s].
+        robot, command: of the walk.
+        walk: a `Trajectory`, or what else has `period`, `initial` and `fallen`.
+    """
+    ticks = (jnp.arange(len(walk.fallen)) + 1.0) / jnp.round(tick / walk.period)
+    anchor = anchor_at(robot, walk.initial, 0)
+    return jax.vmap(lambda t: reference_at(tick, command, anchor, t))(ticks)
