@@ -199,7 +199,7 @@ def draw_race(path: Path) -> None:
             band = losses.min(axis=1), losses.max(axis=1)
             axes.fill_between(counts, *band, color=line["color"], alpha=0.15, linewidth=0)
         axes.set(
-            xlabel="walks on the simulator (median and range of three repeats)",
+            xlabel="walks on the simulator (median and range of the repeats)",
             ylabel="loss of the best so far [10$^6$]",
         )
         axes.set(xlim=(-2, 202), ylim=(0, None))

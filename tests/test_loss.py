@@ -1,6 +1,7 @@
 """The loss: sums by hand, the same number in every world, what a fall costs."""
 
 import json
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -18,7 +19,15 @@ from hector_jax.grfm.effect import last_command
 from hector_jax.report.report import render
 from hector_jax.store.folder import as_line
 from hector_jax.tuning.difftune import TuneConfig, tune
-from hector_jax.tuning.loss import PAPER_LOSS, LossTerm, between_loss, losses, switch_loss, total
+from hector_jax.tuning.loss import (
+    PAPER_LOSS,
+    LossTerm,
+    between_loss,
+    loss_of_robot,
+    losses,
+    switch_loss,
+    total,
+)
 from hector_jax.tuning.rollout import RolloutConfig, Scenario
 from hector_jax.verdict import metrics
 
@@ -128,6 +137,23 @@ def test_a_fourth_term_is_tuned_told_and_written_from_one_place():
     assert result["alpha"]["L_sway"] == 1e4
     assert result["sets"]["mine"]["standin"]["L_sway"]["mean"] == walks[0].losses["L_sway"]
     assert "L_sway [m^2/s^2]" in render("verdict.md.j2", verdict=verdict)
+
+
+def test_a_robot_that_is_elsewhere_can_still_go_as_fast_as_it_should():
+    """Velocities count along the robot's own yaw; a file adds the terms by their names."""
+    weights = (("L_vel", 2.0), ("L_yaw_rate", 3.0))
+    loss = loss_of_robot(replace(ROBOT.description, loss=weights))
+    assert loss[:3] == PAPER_LOSS
+    ahead, aside = np.tile([0.5, 0.0, 0.0], (6, 1)), np.tile([0.0, 0.5, 0.0], (6, 1))
+    quarter, there = np.tile([0.0, 0.0, np.pi / 2], (6, 1)), walk()
+    there = there._replace(reference=there.reference._replace(velocity=ahead))
+    moved = State(quarter, 7.0 + 0.0 * quarter, 0.0 * quarter, aside)
+    found = losses(loss, there._replace(state=moved))
+    np.testing.assert_allclose([found["L_vel"], found["L_yaw_rate"]], 0.0, atol=1e-12)
+    slow = moved._replace(velocity=0.5 * aside, ang_velocity=0.1 * quarter)
+    found = losses(loss, there._replace(state=slow))
+    np.testing.assert_allclose(found["L_vel"], 60 * 0.25**2)
+    np.testing.assert_allclose(found["L_yaw_rate"], 60 * (0.1 * np.pi / 2) ** 2)
 
 
 def test_terms_that_cannot_be_told_apart_are_refused():

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hector_jax.cli.flags import Collect, Evaluate, Search, Train, Verdict, View, Walk
+from hector_jax.cli.flags import Check, Collect, Evaluate, Search, Train, Tune, Verdict, View, Walk
 from hector_jax.control import trajectories
 from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import gait_named
@@ -25,9 +25,10 @@ from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree_file import ROBOT_DIGITS, read_card, tree_hash
 from hector_jax.robot.description import Description
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.sim.engine import MUJOCO_C, Engine
+from hector_jax.sim.engine import MUJOCO_C, Engine, choose_engine
 from hector_jax.sim.loop import Job, check_plant
 from hector_jax.sim.standin import FAMILIES
+from hector_jax.sim.walker import walker_engine, walker_of
 from hector_jax.sim.world import Imperfections, named_world
 from hector_jax.store.cache import robot_hash
 from hector_jax.store.folder import RunRequest
@@ -44,6 +45,20 @@ def weights_by_name(text: str, robot: Robot) -> Weights:
     """
     named = {"nominal": nominal, "expert": expert, "best": best}
     return named[text](robot) if text in named else load_weights(Path(text), robot)
+
+
+def engine_of(args: Evaluate | Tune | Verdict | Walk) -> Engine:
+    """Return the engine that the flags name, or the program of the user in its place.
+
+    Raises:
+        InputError: both are given, or it is not there.
+    """
+    flag = "walk_engine" if isinstance(args, Tune) else "engine"
+    if args.walker is None:
+        return choose_engine(getattr(args, flag))
+    if args.is_given(flag):
+        raise InputError(f"--{flag.replace('_', '-')} and --walker: only one can be given")
+    return walker_engine(walker_of(args.walker, args.walker_limit))
 
 
 def short_names(texts: Sequence[str]) -> dict[str, str]:
@@ -215,7 +230,7 @@ def load_trajectories(
     return loaded
 
 
-def walk_seconds(args: Evaluate | Verdict | Walk | View, trajectory: NamedCommand) -> float:
+def walk_seconds(args: Check | Evaluate | Verdict | Walk | View, trajectory: NamedCommand) -> float:
     """Return the length of a walk [s]: from the trajectory's file if it has one, else --seconds.
 
     Raises:

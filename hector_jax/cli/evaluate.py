@@ -31,7 +31,7 @@ from hector_jax.report.report import print_table
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.diagnosis import Fall, fall_of
-from hector_jax.sim.engine import MUJOCO_C, choose_engine
+from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.store import nets, tunings
 from hector_jax.store.setup import Setup
@@ -57,7 +57,7 @@ def run_evaluate(args: Evaluate) -> None:
     seeds = range(args.first_seed, args.first_seed + count)
     sets = {text: arguments.weights_by_name(text, robot) for text in args.weights}
     plants = arguments.plants(args.world, seeds, (plant or robot).description)
-    config, engine = tunings.tune_config(robot), choose_engine(args.engine)
+    config, engine = tunings.tune_config(robot), arguments.engine_of(args)
     with workers(args.processes) as pool:
         title = f"evaluating on {plural(count, 'plant')} of {args.world}"
         walks = judging.judge(
@@ -97,9 +97,10 @@ def run_walk(args: Walk) -> None:
     plant = arguments.plant_of(args.plant, robot)
     if args.world == "srbm" and plant is not None:
         raise InputError("--plant needs a world of MuJoCo, got --world srbm")
-    if args.world == "srbm" and args.engine != "c":
-        raise InputError(f"--engine {args.engine} needs a world with a plant, got --world srbm")
-    engine, weights = choose_engine(args.engine), arguments.weights_by_name(args.weights, robot)
+    if args.world == "srbm" and (args.engine != "c" or args.walker):
+        flag = "--walker" if args.walker else f"--engine {args.engine}"
+        raise InputError(f"{flag} needs a world with a plant, got --world srbm")
+    engine, weights = arguments.engine_of(args), arguments.weights_by_name(args.weights, robot)
     command = arguments.load_trajectory(args.traj, robot)
     loss, config = loss_of_robot(robot.description), walk_config(robot)
     say("compiling (only the first time on a machine) and walking")

@@ -119,6 +119,15 @@ class ForRobot(Flags):
     robot: RobotFile = None  # TOML file of another robot; HECTOR by default
 
 
+@dataclass(frozen=True, kw_only=True)
+class ByWalker(Flags):
+    """A command whose walks a program of the user can make."""
+
+    # program that walks with a controller and a simulator of its own (docs/howto/own.md)
+    walker: Annotated[Path | None, PathKind.FILE] = None
+    walker_limit: Annotated[float, Range(1, 86_400)] = 600.0  # longest time of one of its walks [s]
+
+
 @_command
 class Collect(Configured, ForRobot, Parallel):
     """Walk on the high-fidelity simulator and record the measured ground forces.
@@ -160,7 +169,7 @@ class Grfm(Configured, Parallel, Printed):
 
 
 @_command
-class Tune(Configured, Parallel):
+class Tune(Configured, ByWalker, Parallel):
     """Tune the MPC weights for trajectories, with and without the net, and evaluate them.
 
     Example: hector tune --traj straight c s --seeds 32
@@ -247,7 +256,7 @@ class Search(Configured, ForRobot, Parallel, Printed):
 
 
 @_command
-class Evaluate(Configured, ForRobot, Parallel, Printed):
+class Evaluate(Configured, ForRobot, ByWalker, Parallel, Printed):
     """Evaluate weight sets on the plants of a world and print a table.
 
     Example: hector evaluate --traj c --weights nominal expert mine.json
@@ -266,7 +275,7 @@ class Evaluate(Configured, ForRobot, Parallel, Printed):
 
 
 @_command
-class Verdict(Configured, ForRobot, Parallel, Printed):
+class Verdict(Configured, ForRobot, ByWalker, Parallel, Printed):
     """Evaluate weight sets in several engines and models, and say what may be claimed of them.
 
     Example: hector verdict --weights nominal expert with=runs/tuned --light-heavy
@@ -288,7 +297,7 @@ class Verdict(Configured, ForRobot, Parallel, Printed):
 
 
 @_command
-class Walk(Configured, ForRobot, Printed):
+class Walk(Configured, ForRobot, ByWalker, Printed):
     """Walk once and report losses and tracking errors.
 
     Example: hector walk --traj s --world standin --seed 3 --weights expert --video walk.mp4
@@ -304,6 +313,18 @@ class Walk(Configured, ForRobot, Printed):
     plant: RobotFile = None  # TOML file of another model of the robot, which is walked on
     gait: Gait = "own"  # that of the robot's file, walk, trot, pace, crawl or stand
     engine: OneEngine = "c"  # c: MuJoCo; mjx: it knows its state exactly; extras: drake, pinocchio
+
+
+@_command
+class Check(ForRobot, Printed):
+    """Say what in the log of a walk no weights can mend: mass, delay, joints, units and so on.
+
+    Example: hector check mine.npz --traj straight
+    """
+
+    log: Annotated[Path, PathKind.FILE]  # of any controller (docs/howto/own.md)
+    traj: Trajectory = "straight"  # that was walked: a name or a TOML file
+    seconds: Seconds = 4.0  # length of the walk [s]
 
 
 @_command

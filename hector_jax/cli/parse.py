@@ -36,6 +36,7 @@ OVERVIEW = {
         "compare": "finished runs side by side",
     },
     "Tune on the walks of a robot, or of a simulator elsewhere": {
+        "check": "what of the log of a walk no weights can mend",
         "propose": "the weights to walk with next",
         "report": "take the logs of these walks",
     },

@@ -20,7 +20,6 @@ from hector_jax.core.files import as_json, make_folder, write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.settings import convert
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.sim.engine import choose_engine
 from hector_jax.store.cache import robot_hash
 from hector_jax.store.folder import CONFIG, VERSIONS, flattened, read_object
 from hector_jax.store.nets import COLLECTION_CODE
@@ -34,6 +33,9 @@ _CODE = (*COLLECTION_CODE, "grfm.training", "sim.standin", "verdict.choice", "wa
 _CALL_FLAGS = ("config", "each", "out", "resume", "runs")
 # flags that may change when a run is resumed
 _FREE_FLAGS = ("data", "json", "processes", "verdict", "video")
+
+
+_OF_OUR_CONTROLLER = "alpha data iterations net safe smooth variant verdict".split()
 
 
 def exists_error(folder: Path) -> InputError:
@@ -56,7 +58,8 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
     if 0 < args.walks < (least := 2 * count * plants):
         walks = f"{plural(count, 'command')} on {plural(plants, 'plant')}, twice"
         raise InputError(f"--walks must be 0 or at least {least} ({walks}), got {args.walks}")
-    choose_engine(args.walk_engine)  # whether it is installed
+    _check_walker(args)
+    arguments.engine_of(args)  # whether it is installed
     start, of_legs = arguments.weights_by_name(args.start, robot), leg_numbers(args.tune)
     if of_legs and not args.walks:
         text = "only --walks can tune what the rigid-body model does not have"
@@ -65,6 +68,17 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
     if args.safe and "position_limit" in start.others:
         raise InputError("--safe sets the position limit, which --start has already")
     return loaded
+
+
+def _check_walker(args: Tune) -> None:
+    """Raise an InputError if the flags of a tuning do not go with a program of the user."""
+    if args.walker is None:
+        return
+    if not args.walks:
+        raise InputError("--walker needs --walks, the number of its walks that a tuning may take")
+    if given := [name for name in _OF_OUR_CONTROLLER if args.is_given(name)]:
+        flag = given[0].replace("_", "-")
+        raise InputError(f"--{flag} is for this project's controller, so not beside --walker")
 
 
 def run_flags(args: Tune) -> Tune:

@@ -14,6 +14,7 @@ import numpy as np
 from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import BASELINES, Tune, Walk
+from hector_jax.cli.own import tune_own
 from hector_jax.cli.parse import as_command
 from hector_jax.cli.verdict import small_verdict
 from hector_jax.control.parameters import leg_numbers, model_numbers, step_names
@@ -34,7 +35,6 @@ from hector_jax.report.run import write_run_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.diagnosis import fall_of
-from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
@@ -71,7 +71,7 @@ def run_tune(args: Tune) -> None:
     for folder, flags in runs.items():
         with locked(folder):
             say(f"the run folder is {folder}")
-            _tune_in(folder, flags)
+            (tune_own if flags.walker else _tune_in)(folder, flags)
 
 
 class _Run(NamedTuple):
@@ -299,7 +299,7 @@ def _campaign(run: _Run, start: Weights) -> Campaign:
         run.commands,
         plants,
         leg_numbers=leg_numbers(run.args.tune),
-        engine=choose_engine(run.args.walk_engine),
+        engine=arguments.engine_of(run.args),
     )
 
 

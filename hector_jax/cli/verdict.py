@@ -99,8 +99,7 @@ def plan_of(args: Verdict) -> VerdictPlan:
         if (name := plant.description.name) in models:
             raise InputError(f"--plant {path}: there is a model {name!r} already")
         models[name] = PlantModel(plant=plant)
-    names = args.engine
-    engines = _installed(say) if "all" in names else {name: choose_engine(name) for name in names}
+    engines = _engines(args)
     columns = {
         Column(engine, model): _seeds(args, first=engine == next(iter(engines)), own=model == OWN)
         for engine in engines
@@ -108,6 +107,15 @@ def plan_of(args: Verdict) -> VerdictPlan:
     }
     sets = _sets(args, robot, trajectories)
     return VerdictPlan(robot, args.family, trajectories, sets, models, columns, engines)
+
+
+def _engines(args: Verdict) -> dict[str, Engine]:
+    if args.walker:
+        engine = arguments.engine_of(args)
+        return {engine.name: engine}
+    if "all" in args.engine:
+        return _installed(say)
+    return {name: choose_engine(name) for name in args.engine}
 
 
 def _seeds(args: Verdict, *, first: bool, own: bool) -> range:
@@ -169,7 +177,7 @@ def _plan_text(plan: VerdictPlan) -> str:
     walks = plural(per_plant * sum(map(len, plan.columns.values())), "walk")
     texts = [f"{report.title_of(column)} ({len(seeds)})" for column, seeds in plan.columns.items()]
     parts = [f"{walks}: {per_plant} on each plant", f"plants: {', '.join(texts)}"]
-    parts += [f"in {report.TITLES[name]} {differs}" for name, differs in plan.differs.items()]
+    parts += [f"in {plan.engines[name].title} {text}" for name, text in plan.differs.items()]
     return "; ".join(parts)
 
 
@@ -177,7 +185,7 @@ def walk_cells(setup: Setup, plan: VerdictPlan, folder: Path) -> Cells:
     """Do all walks, engine by engine; walks whose scores are in the folder are not repeated."""
     scored = {}
     for name, engine in plan.engines.items():
-        options = {"title": f"walking in {report.TITLES[name]}", "folder": folder, "engine": engine}
+        options = {"title": f"walking in {engine.title}", "folder": folder, "engine": engine}
         scored |= judging.score_jobs(setup, _jobs(plan, name), **options)
     cells = {}
     for column, seeds in plan.columns.items():

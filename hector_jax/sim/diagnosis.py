@@ -156,7 +156,8 @@ def _tilt_of(points: Float[np.ndarray, "c 3"]) -> float:
     return float(slopes.max())
 
 
-def _motors(robot: Robot, torque: Float[np.ndarray, "n joints"]) -> Iterator[Fault]:
+def motors(robot: Robot, torque: Float[np.ndarray, "n joints"]) -> Iterator[Fault]:
+    """Yield where each motor is at its limit; `torque` is a share of the limits."""
     remedy = "a slower trajectory, another gait, or a larger limit"
     named = zip(robot.description.joints, robot.torque_limit, torque.T, strict=True)
     for name, limit, share in named:
@@ -178,7 +179,7 @@ def _feet(robot: Robot, record: Record) -> Iterator[Fault]:
     yield Fault("the legs touch each other", record.legs_touch, remedy)
 
 
-def _lasting(
+def lasting(
     faults: Iterable[Fault], rows: slice | Bool[np.ndarray, " n"], most: float, span: str
 ) -> list[str]:
     """Return a line for each fault in a share of the rows above `most`, the longest first."""
@@ -229,8 +230,8 @@ def likeliest_cause(robot: Robot, record: Record) -> str:
     count = max(int(np.argmax(over)) if over.any() else len(over), 1)
     rows = slice(max(count - round(BEFORE_FALL / TIME_STEP), 0), count)
     span = f"the {TIME_STEP * (count - rows.start):.2g} s before it"
-    faults = *_motors(robot, record.torque), *_feet(robot, record)
-    if lines := _lasting(faults, rows, MOST_BEFORE_FALL, span):
+    faults = *motors(robot, record.torque), *_feet(robot, record)
+    if lines := lasting(faults, rows, MOST_BEFORE_FALL, span):
         return lines[0]
     error = record.height[rows] - standing
     if _grows(error, record.tilt[rows] / max_tilt):
@@ -265,7 +266,8 @@ def _grows(error: Float[np.ndarray, " n"], tilt: Float[np.ndarray, " n"]) -> boo
     return bool(early < middle < late)
 
 
-def _steady_height(trajectory: Trajectory, rows: Bool[np.ndarray, " T"]) -> list[str]:
+def steady_height(trajectory: Trajectory, rows: Bool[np.ndarray, " T"]) -> list[str]:
+    """Return a line if the height has a steady error in some samples of a walk."""
     errors = (trajectory.state.position - trajectory.reference.position)[rows, 2]
     if len(errors) < 3:
         return []
@@ -290,6 +292,6 @@ def not_the_weights(config: WalkConfig, robot: Robot, job: Job) -> list[str]:
     record = record_walk(config, robot, job)
     end = record.time[-1] - FALLING * record.fallen
     time = float(record.trajectory.period) * np.arange(1, len(record.trajectory.fallen) + 1)
-    upright, motors = (time > SETTLED) & (time <= end), _motors(robot, record.torque)
-    lines = _lasting(motors, record.time <= end, MOST_AT_LIMIT, "the time")
-    return [*_steady_height(record.trajectory, upright), *lines]
+    upright, late = (time > SETTLED) & (time <= end), motors(robot, record.torque)
+    lines = lasting(late, record.time <= end, MOST_AT_LIMIT, "the time")
+    return [*steady_height(record.trajectory, upright), *lines]

@@ -33,8 +33,8 @@ def read_walk(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Tr
         tick: that of the gait [s], a whole number of periods.
 
     Returns:
-        The walk (numpy) without reference; from its end on, samples repeat the last one and are
-        marked `fallen`. And how it ended, "fell after 1.20 s", or nothing.
+        The walk (numpy), with the reference of the file, if any; from its end on, samples repeat
+        the last one and are marked `fallen`. And how it ended, "fell after 1.20 s", or nothing.
 
     Raises:
         InputError: one line naming the file and the entry that is missing, of another shape, or not
@@ -60,6 +60,8 @@ def read_walk(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Tr
     for name, x in named_leaves(walk).items():
         if not np.isfinite(x[: max(valid, 1)] if np.ndim(x) and len(x) == count else x).all():
             raise InputError(f"{path}: {name} must hold finite numbers")
+    if (angle := np.abs(walk.state.euler[:valid, :2]).max(initial=0.0)) > np.pi:
+        raise InputError(f"{path}: roll or pitch reaches {angle:.3g}, expected radians")
     rows = np.minimum(np.arange(wanted), valid - 1)
     samples = jax.tree.map(lambda x: x[rows], walk._replace(period=None, initial=None))
     down = np.asarray(has_fallen(samples.state, *robot.description.limits))
@@ -89,7 +91,7 @@ def _checked(path: Path, arrays: dict[str, Any], empty: Trajectory, count: int) 
         if name not in arrays and name.startswith(_NEEDED):
             names = ", ".join(n for n in named_leaves(empty) if n.startswith(_NEEDED))
             raise InputError(f"{path}: {name} is missing; expected {names}")
-        found[name] = default if name.startswith("reference.") else arrays.get(name, default)
+        found[name] = arrays.get(name, default)
         if (got := found[name].shape) != shape:
             raise InputError(f"{path}: {name} must have shape {shape}, got {got}")
         if found[name].dtype.kind not in "biuf":

@@ -27,15 +27,17 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from hector_jax.core.arrays import Array
+from hector_jax.core.geometry import rot_z
 from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError, short_repr, unknown
 from hector_jax.core.settings import NOT_NEGATIVE, convert
-from hector_jax.core.trajectory import Trajectory, Wrench
+from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.robot.description import Description
 
 SAMPLE = 1e-3  # [s] period of the paper's sums
 FALL_POSITION = 0.5  # [m] minimum error after a fall, if the height is less
 FALL_EULER = 0.8  # [rad] minimum error after a fall
+FALL_VELOCITY, FALL_RATE = 1.0, 1.0  # [m/s], [rad/s] minimum errors after a fall
 
 
 class LossTerm(NamedTuple):
@@ -104,12 +106,38 @@ def control_loss(trajectory: Trajectory) -> Float[Array, ""]:
     return jnp.sum(_squared_changes(trajectory.command, trajectory.fallen))
 
 
+def velocity_loss(trajectory: Trajectory) -> Float[Array, ""]:
+    """Sum the squared error of the velocity ahead and aside [m^2/s^2] over 1 kHz samples.
+
+    Each velocity is seen along its own yaw, so that it does not matter where the robot is.
+    """
+
+    def along_yaw(state: State) -> Float[Array, "T 3"]:
+        return jnp.einsum("tji,tj->ti", jax.vmap(rot_z)(state.euler[:, 2]), state.velocity)
+
+    error = along_yaw(trajectory.state) - along_yaw(trajectory.reference)
+    return _tracking_loss(trajectory, error * jnp.array([1.0, 1.0, 0.0]), FALL_VELOCITY)
+
+
+def yaw_rate_loss(trajectory: Trajectory) -> Float[Array, ""]:
+    """Sum the squared error of the yaw rate [rad^2/s^2] over 1 kHz samples."""
+    error = trajectory.state.ang_velocity - trajectory.reference.ang_velocity
+    return _tracking_loss(trajectory, error * jnp.array([0.0, 0.0, 1.0]), FALL_RATE)
+
+
 PAPER_LOSS: Loss = (
     LossTerm("L_Eul", "rad^2", 1e5, euler_loss),
     LossTerm("L_pos", "m^2", 2e5, position_loss),
     LossTerm("L_ctrl", "N^2, (N m)^2", 1.0, control_loss),
 )
 """The loss of the paper. Source: Eq. 11."""
+
+OPTIONAL_TERMS: Loss = (
+    LossTerm("L_vel", "m^2/s^2", 0.0, velocity_loss),
+    LossTerm("L_yaw_rate", "rad^2/s^2", 0.0, yaw_rate_loss),
+)
+"""Terms that a robot's description may add, for a controller whose reference starts at the robot in
+each plan: it cannot know where it should be, but how fast."""
 
 
 def losses(loss: Loss, trajectory: Trajectory) -> Terms:
@@ -210,12 +238,14 @@ def smoother(loss: Loss, price: float) -> Loss:
 
 
 def loss_of_robot(description: Description) -> Loss:
-    """Return the paper's loss with the weights of a robot's description.
+    """Return the paper's loss with the weights of a robot's description, and terms that it adds.
 
     Raises:
         InputError: one line naming the file, for an unknown term or a wrong weight.
     """
+    weights = dict(description.loss)
+    added = tuple(term for term in OPTIONAL_TERMS if term.name in weights)
     try:
-        return with_alphas(dict(description.loss))
+        return with_alphas(weights, PAPER_LOSS + added)
     except InputError as error:
         raise InputError(f"{description.path}: loss: {error}") from None

@@ -23,7 +23,7 @@ from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree import stack
 from hector_jax.tuning.loss import PAPER_LOSS, Loss, alphas, losses, switch_loss, total
 
-BASELINES = ("nominal", "expert")
+BASELINES = ("nominal", "expert", "start")
 
 COVERAGE = 0.95  # of an interval
 RESAMPLES, FEWEST = 10_000, 4  # resamples of a bootstrap; fewest samples for an interval

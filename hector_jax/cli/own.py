@@ -1,0 +1,107 @@
+"""A controller of the user: what the logs of its walks show, and a tuning on its walks."""
+
+from functools import partial
+from pathlib import Path
+
+from hector_jax.cli import arguments, run_folder
+from hector_jax.cli.arguments import print_result
+from hector_jax.cli.flags import Check, Tune
+from hector_jax.control.controller import walk_config
+from hector_jax.control.parameters import leg_numbers, model_numbers
+from hector_jax.control.weights_file import save_weights
+from hector_jax.core.console import say
+from hector_jax.core.environment import environment
+from hector_jax.core.files import write_json
+from hector_jax.core.inputs import plural
+from hector_jax.core.runtime import workers
+from hector_jax.report.report import print_table
+from hector_jax.robot.model import load_robot
+from hector_jax.sim.log_check import check_log, read_check
+from hector_jax.sim.loop import Job
+from hector_jax.sim.walker import walker_of, write_log
+from hector_jax.sim.world import hfs
+from hector_jax.store import tunings
+from hector_jax.store.folder import RESULT
+from hector_jax.store.setup import Setup
+from hector_jax.verdict import choice, judging, metrics
+from hector_jax.walk_tuning.campaign import Campaign
+from hector_jax.walk_tuning.walks import answer, campaign_space, changes_by_walk, tune_on_walks
+
+
+def run_check(args: Check) -> None:
+    """Say what of a log no weights can mend."""
+    robot = load_robot(args.robot)
+    trajectory = arguments.load_trajectory(args.traj, robot)
+    seconds, tick = arguments.walk_seconds(args, trajectory), walk_config(robot).gait.tick
+    log, end = read_check(args.log, robot, trajectory.command, seconds, tick)
+    lines = [*([end] if end else []), *check_log(log, tick)]
+    text = "\n".join(lines or ["nothing is found that weights could not mend"])
+    print_result(args.json, {"found": lines}, lambda: print(text))
+
+
+def tune_own(folder: Path, args: Tune) -> None:
+    """Tune on the walks of a program, from those in the folder on; compare start and `best`.
+
+    Whether the start stays `best` is decided on plants that were not walked, and the table is of
+    others again.
+    """
+    robot, made_with = load_robot(args.robot), environment()
+    trajectories = run_folder.trajectories(args, robot)
+    config = tunings.tune_config(robot, others=model_numbers(args.tune))
+    config = arguments.with_length(config, trajectories[0])
+    seconds = trajectories[0].seconds or config.rollout.ticks * config.rollout.walk.gait.tick
+    commands = {name: command for name, command, _ in trajectories}
+    start, engine = arguments.weights_by_name(args.start, robot), arguments.engine_of(args)
+    plants = choice.drawn_plants(robot, args.walk_plants) or [hfs(robot.description)]
+    seeds, first = range(args.seeds), trajectories[0]
+    log = folder / "first.npz"
+    if args.walker and not log.exists():
+        walker = walker_of(args.walker, args.walker_limit)
+        write_log(walker, Job(start, first.command, plants[0], seconds), log)
+    tick = config.rollout.walk.gait.tick
+    for line in check_log(read_check(log, robot, first.command, seconds, tick)[0], tick):
+        say(f"before any tuning, {first.name}: {line}")
+    with workers(args.processes) as pool:
+        campaign = Campaign(
+            folder / "walks",
+            config,
+            robot,
+            start,
+            commands,
+            plants,
+            leg_numbers=leg_numbers(args.tune),
+            engine=engine,
+        )
+        rows = tune_on_walks(pool, campaign, args.walks)
+        weights, number = answer(campaign, campaign_space(pool, campaign), rows)
+        sets = {"set 0": campaign.start, f"set {number}": weights}
+        setup = Setup(pool, config, robot, made_with.get("commit", ""))
+        options = {"seconds": seconds, "folder": folder / "scores", "engine": engine}
+        chosen = choice.walks_best(setup, sets, [*commands.values()], choice.HELD_OUT, **options)
+        compared = {"start": sets["set 0"], "best": sets[chosen]}
+        for name, weights in compared.items():
+            save_weights(folder / "weights" / f"{name}.json", weights)
+        drawn = arguments.plants("standin", seeds, robot.description)
+        judge = partial(judging.judge, setup, compared, plants=drawn, seeds=seeds, **options)
+        title = f"evaluating on {plural(len(seeds), 'plant')}"
+        scores = {n: judge(command=c, title=f"{title}, {n}").scores for n, c in commands.items()}
+    verdicts = {", ".join(commands): metrics.make_verdict(config.loss, seeds, scores)}
+    by_name = {
+        name: metrics.make_verdict(config.loss, seeds, {name: scores[name]}) for name in commands
+    }
+    result = {
+        **metrics.verdict_result(next(iter(verdicts.values()))),
+        "trajectories": {name: metrics.verdict_result(by_name[name]) for name in commands},
+        "walks": [change._asdict() for change in changes_by_walk(rows)],
+        "chosen": chosen,
+    }
+    write_json(folder / RESULT, result)
+
+    def print_text() -> None:
+        for name, verdict in (verdicts | by_name).items():
+            print_table(verdict, f"{name}, {plural(len(seeds), 'plant')}", engine.title)
+
+    print_result(args.json, {"run": str(folder), **result}, print_text)
+    if chosen == "set 0":
+        say("on plants that were not walked nothing is better than the start: `best` is the start")
+    say(f"the weights are {folder / 'weights' / 'best.json'}")

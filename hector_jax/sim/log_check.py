@@ -1,0 +1,267 @@
+"""Is it the weights? What the log of a walk shows that no weight can mend.
+
+The log may be of any controller on any robot or simulator (`walk_file`). Each question has a line
+with a figure where the answer is bad. Questions whose entries the log does not have are not asked.
+"""
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hector_jax.control.reference import Command
+from hector_jax.core.geometry import euler_rates, rotation_from_euler
+from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import SOLVED, State, Trajectory
+from hector_jax.robot.kinematics import foot_poses
+from hector_jax.robot.model import Robot
+from hector_jax.sim.diagnosis import FALLING, MOST_AT_LIMIT, STEADY, lasting, motors, steady_height
+from hector_jax.sim.walk_file import read_walk, reference_of
+
+SETTLED = 0.5  # [s] after t = 0
+LOADED = 0.2  # share of the weight on a foot that stands
+MASS = 0.05  # share of the weight
+LONGEST, LATE = 0.06, 0.015  # [s] delays of the ground's force that are tried; largest usual one
+GAIN = 0.15  # of the ground's force by the commanded one, from 1
+IN_AIR = 0.02  # share of the weight
+SLIDING, BETTER = 0.25, 0.5  # [m/s] of feet that stand; share of it that names a cause
+UNLIKE = 0.3  # of a velocity, from the derivative of what it is the velocity of
+FOLLOWS = 0.3  # of the robot's distance from the path, that is left to a reference that follows it
+
+
+class Log(NamedTuple):
+    """A log with its robot; rows of all arrays are the settled samples before a fall."""
+
+    robot: Robot
+    walk: Trajectory  # with the reference of the command
+    own: State | None  # reference in the log
+    torque: Float[np.ndarray, "n joints"] | None  # as a share of the limits
+    has_effect: bool
+    yaw_jump: float | None  # [s] time of the first jump by a turn
+    stance: Bool[np.ndarray, "n feet"]
+
+    @property
+    def weight(self) -> float:
+        """Of the robot's file [N]."""
+        return float(self.robot.mass * self.robot.gravity[2])
+
+
+def read_check(
+    path: Path, robot: Robot, command: Command, seconds: float, tick: float
+) -> tuple[Log, str]:
+    """Read a log for `check_log`; returns also how the walk ended.
+
+    Raises:
+        InputError: see `read_walk`; or nothing of the walk is left after SETTLED, or `torque` has
+            another shape.
+    """
+    whole, end = read_walk(path, robot, seconds, tick)
+    with np.load(path) as archive:
+        names, torque = {*archive.files}, archive.get("torque")
+    reference = jax.tree.map(np.asarray, reference_of(tick, robot, command, whole))
+    period, count = float(whole.period), int(np.sum(~whole.fallen))
+    rows = slice(round(SETTLED / period), count - round(FALLING / period) * bool(end))
+    if rows.start + 10 >= rows.stop:
+        raise InputError(f"{path}: ends after {count * period:.2f} s, too early to tell anything")
+    if torque is not None and (torque.ndim != 2 or torque.shape[1] != len(robot.torque_limit)):
+        shape = (count, len(robot.torque_limit))
+        raise InputError(f"{path}: torque must have shape {shape}, got {torque.shape}")
+    cut = partial(jax.tree.map, lambda x: np.asarray(x)[rows])
+    own = cut(whole.reference) if "reference.position" in names else None
+    walk = cut(whole._replace(period=None, initial=None, reference=reference))
+    walk = walk._replace(period=whole.period, initial=whole.initial)
+    loaded = walk.command.force[..., 2] > LOADED * float(robot.mass * robot.gravity[2])
+    share = None if torque is None else torque[rows] / np.asarray(robot.torque_limit)
+    stance = walk.contact if walk.contact.any() else loaded
+    jumps = np.flatnonzero(np.abs(np.diff(whole.state.euler[:, 2])) > np.pi)
+    jump = period * (1 + float(jumps[0])) if len(jumps) else None
+    return Log(robot, walk, own, share, "effect.force" in names, jump, stance), end
+
+
+def check_log(log: Log, tick: float) -> list[str]:
+    """Return a line for each fault that no weight can mend, what to look at first in front.
+
+    Args:
+        log: of `read_check`.
+        tick: interval of this project's plans [s].
+    """
+    questions = _velocities, _legs, _loads, _ground, _air, _torques, _reference, _plans
+    return [line for ask in questions for line in ask(log, tick)]
+
+
+def _slope(x: Float[np.ndarray, "n 3"], period: float) -> Float[np.ndarray, "m 3"]:
+    """Return derivatives over about 20 ms, in the middle of each span."""
+    span = max(round(0.02 / period), 2)
+    return (x[span:] - x[:-span]) / (span * period)
+
+
+def _middle(x: np.ndarray, period: float) -> np.ndarray:
+    """Return the means over the spans of `_slope`."""
+    span = max(round(0.02 / period), 2)
+    sums = np.cumsum(np.concatenate([np.zeros_like(x[:1]), x]), axis=0)[1:]
+    return (sums[span:] - sums[:-span]) / span
+
+
+def _velocities(log: Log, tick: float) -> Iterator[str]:
+    """Is each velocity the derivative of what it is the velocity of, in the world?"""
+    state, period = log.walk.state, float(log.walk.period)
+    if log.yaw_jump is not None:
+        yield f"yaw jumps by a turn at {log.yaw_jump:.2f} s: a log needs it continuous"
+        return
+    R = np.asarray(jax.vmap(rotation_from_euler)(state.euler))
+    to_world = partial(np.einsum, "tij,tj->ti", R)
+    E = np.asarray(jax.vmap(euler_rates)(state.euler))
+    rates, body_rates = (
+        np.einsum("tij,tj->ti", E, x) for x in (state.ang_velocity, to_world(state.ang_velocity))
+    )
+    for name, found, true, turned in (
+        ("velocity", state.velocity, state.position, to_world(state.velocity)),
+        ("ang_velocity", rates, state.euler, body_rates),
+    ):
+        slope = _slope(true, period)
+
+        def error(x: np.ndarray, slope: np.ndarray = slope) -> float:
+            away = np.sqrt(np.mean((_middle(x, period) - slope) ** 2))
+            return float(away / max(np.sqrt(np.mean(slope**2)), 0.05))
+
+        if (as_is := error(found)) <= UNLIKE:
+            continue
+        guesses = {"it is in the frame of the trunk": error(turned)}
+        guesses["it is in degrees"] = error(np.radians(found))
+        guesses["its sign is the other one"] = error(-found)
+        guess = min(guesses, key=lambda words: guesses[words])
+        cause = f": {guess}" if guesses[guess] < BETTER * as_is else ""
+        yield f"{name} is {100 * as_is:.0f} % off the derivative of the pose{cause}"
+
+
+def _sliding(log: Log, joints: Float[np.ndarray, "n joints"]) -> tuple[float, float]:
+    """Return the speed of the feet that stand [m/s], RMS, and their mean height [m]."""
+    state, period, robot = log.walk.state, float(log.walk.period), log.robot
+    R = np.asarray(jax.vmap(rotation_from_euler)(state.euler))
+    local = np.asarray(jax.vmap(lambda q: foot_poses(robot, q).position)(joints))
+    feet = np.einsum("tij,tfj->tfi", R, local - np.asarray(robot.com_offset))
+    feet = feet + state.position[:, None]
+    span = max(round(0.02 / period), 2)
+    windows = np.lib.stride_tricks.sliding_window_view(log.stance, 2 * span + 1, axis=0)
+    standing = np.asarray(windows.all(axis=-1))
+    speed = np.linalg.norm(_slope(feet, period), axis=-1)
+    inner = speed[span // 2 :][: len(standing)][standing]
+    heights = feet[log.stance, 2]
+    return float(np.sqrt(np.mean(inner**2))) if len(inner) else 0.0, float(np.mean(heights))
+
+
+def _legs(log: Log, tick: float) -> Iterator[str]:
+    """Do feet that stand stay where the joints say that they are?"""
+    joints, legs = log.walk.joints, log.stance.shape[1]
+    by_leg = joints.reshape(len(joints), legs, -1)
+    speed, height = _sliding(log, joints)
+    names = log.robot.description.joints[: by_leg.shape[2]]
+    if speed > SLIDING:
+        guesses: dict[str, np.ndarray] = {
+            "left and right legs are exchanged": by_leg.reshape(
+                len(joints), -1, 2, by_leg.shape[2]
+            )[:, :, ::-1],
+            "the joints of a leg are in the order from the foot up": by_leg[:, :, ::-1],
+            "they are in degrees": np.radians(by_leg),
+        }
+        for i, name in enumerate(names):
+            signs = np.where(np.arange(len(names)) == i, -1.0, 1.0)
+            guesses[f"the sign of {name} and its likes is the other one"] = by_leg * signs
+        for i in range(len(names) - 1):
+            order = [*range(i), i + 1, i, *range(i + 2, len(names))]
+            guesses[f"{names[i]} and {names[i + 1]} are exchanged"] = by_leg[:, :, order]
+        speeds = {x: _sliding(log, q.reshape(len(joints), -1))[0] for x, q in guesses.items()}
+        guess = min(speeds, key=lambda words: speeds[words])
+        slides = f"by the joints, feet that stand slide at {speed:.2f} m/s"
+        if speeds[guess] < BETTER * speed:
+            yield f"{slides}: {guess}"
+        elif speed > 2.0 * SLIDING:
+            yield f"{slides}: they slip, or joints are wrong in the log"
+    elif abs(height) > STEADY:
+        side = "above" if height > 0.0 else "below"
+        yield (
+            f"by the joints, feet that stand are {100 * abs(height):.1f} cm {side} the floor: foot "
+            "point, leg length or height of the centre of mass in the robot's file"
+        )
+
+
+def _loads(log: Log, tick: float) -> Iterator[str]:
+    """Is the mass that of the file, and does the robot stand at its height?"""
+    force = (log.walk.effect if log.has_effect else log.walk.command).force[..., 2].sum(axis=1)
+    share = float(np.mean(force)) / log.weight
+    if abs(share - 1.0) > MASS:
+        bears = "the ground bears" if log.has_effect else "commanded are"
+        yield (
+            f"{bears} {share * log.weight:.0f} N in the mean, the robot's file weighs "
+            f"{log.weight:.0f} N: its mass is {100 * abs(share - 1):.0f} % "
+            f"{'more' if share > 1 else 'less'} than that of the file"
+        )
+    yield from steady_height(log.walk, np.ones(len(log.stance), bool))
+
+
+def _ground(log: Log, tick: float) -> Iterator[str]:
+    """Does the ground return what was commanded, and when?"""
+    if not log.has_effect:
+        return
+    period, command = float(log.walk.period), log.walk.command.force[..., 2]
+    effect, fits = log.walk.effect.force[..., 2], {}
+    for lag in range(round(LONGEST / period) + 1):
+        x, y = command[: len(command) - lag].ravel(), effect[lag:].ravel()
+        gain = float(x @ y / max(x @ x, 1e-9))
+        fits[lag] = float(np.mean((y - gain * x) ** 2)), gain
+    lag = min(fits, key=lambda n: fits[n][0])
+    gain = fits[lag][1]
+    if lag * period > LATE:
+        yield (
+            f"the ground's force comes {1e3 * lag * period:.0f} ms after the commanded one: "
+            "motors, bus or filters are late"
+        )
+    if abs(gain - 1.0) > GAIN:
+        yield f"the ground's force is {gain:.2f} times the commanded one: torques or their units"
+
+
+def _air(log: Log, tick: float) -> Iterator[str]:
+    """Are feet in the air free of commanded forces?"""
+    force = np.linalg.norm(log.walk.command.force, axis=-1)[~log.stance]
+    if log.walk.contact.any() and len(force) and force.mean() > IN_AIR * log.weight:
+        yield (
+            f"feet in the air are commanded {force.mean():.0f} N in the mean: the plan's contacts "
+            "are not those that are walked"
+        )
+
+
+def _torques(log: Log, tick: float) -> Iterator[str]:
+    """Are motors at their limits?"""
+    if log.torque is not None:
+        rows = np.ones(len(log.torque), bool)
+        yield from lasting(motors(log.robot, log.torque), rows, MOST_AT_LIMIT, "the time")
+
+
+def _reference(log: Log, tick: float) -> Iterator[str]:
+    """Does the controller know where it should be?"""
+    if log.own is None:
+        return
+    rms = lambda x: float(np.sqrt(np.mean(np.sum(x[:, :2] ** 2, axis=1))))  # noqa: E731
+    path, own = log.walk.reference.position, log.own.position
+    away, to_own = rms(log.walk.state.position - path), rms(log.walk.state.position - own)
+    if away > STEADY and to_own < FOLLOWS * away:
+        yield (
+            f"the robot is {100 * away:.0f} cm off the commanded path, {100 * to_own:.0f} cm off "
+            "its own reference, which follows it: set L_pos = 0 and L_vel, L_yaw_rate in [loss]"
+        )
+
+
+def _plans(log: Log, tick: float) -> Iterator[str]:
+    """How often does it plan, and are plans solved?"""
+    force, period = log.walk.command.force.reshape(len(log.stance), -1), float(log.walk.period)
+    changes = np.flatnonzero(np.any(np.diff(force, axis=0) != 0.0, axis=1))
+    interval = period * float(np.median(np.diff(changes))) if len(changes) > 2 else np.inf
+    if interval > 1.5 * tick:
+        yield f"the command changes every {1e3 * interval:.0f} ms: plan more often than that"
+    unsolved = float(np.mean(~(log.walk.residual <= SOLVED)))
+    if unsolved:
+        yield f"{100 * unsolved:.0f} % of the plans are not solved"

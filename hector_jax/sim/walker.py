@@ -1,0 +1,187 @@
+"""A program of the user that walks, with his own controller in his own simulator, as an engine.
+
+For each walk it is called, in its folder and in an environment of its own, as
+
+    FILE request.json log.npz
+
+The request has `weights` (as in a weights file), `command` (periodic pieces: `duration` [s],
+`velocity` forward and to the left [m/s], `yaw_rate` [rad/s]), `seconds`, `seed`, `push` (forces on
+the trunk [N], start and duration [s]) and `plant`, the numbers of a drawn robot (`Imperfections`);
+of these two the program takes what its simulator knows. It writes the log (`walk_file`) and ends
+with code 0.
+"""
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from functools import partial
+from itertools import repeat
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from hector_jax.control.controller import WalkConfig
+from hector_jax.control.weights_file import weights_tree
+from hector_jax.core.console import say
+from hector_jax.core.inputs import InputError, one_line
+from hector_jax.core.trajectory import Trajectory
+from hector_jax.robot.model import Robot
+from hector_jax.sim.engine import Engine
+from hector_jax.sim.loop import Job
+from hector_jax.sim.walk import on_host
+from hector_jax.sim.walk_file import read_walk, reference_of
+
+
+class Walker(NamedTuple):
+    """A program that walks."""
+
+    path: Path
+    limit: float  # [s] of a walk
+    content: str  # hash of the file, which tells its walks from those of another one
+
+
+def walker_of(path: Path, limit: float) -> Walker:
+    """Return the walker of a file.
+
+    Args:
+        path: an executable file, or a Python file, which this interpreter runs.
+        limit: longest time that it may take for a walk [s].
+
+    Raises:
+        InputError: there is no such file, or it cannot be executed.
+    """
+    path = Path(path).resolve()
+    if not path.is_file():
+        raise InputError(f"walker {path}: no such file")
+    if path.suffix != ".py" and not os.access(path, os.X_OK):
+        raise InputError(f"walker {path}: expected a Python file or an executable one (chmod +x)")
+    return Walker(path, limit, hashlib.sha256(path.read_bytes()).hexdigest()[:16])
+
+
+def walker_engine(walker: Walker) -> Engine:
+    """Return a walker as an engine."""
+    name = walker.path.name
+    return Engine(
+        name=name,
+        title=f"simulator of {name}",
+        walk=partial(_walk, walker),
+        bits=_bits,
+        modules=("sim.walker",),
+        differs=f"the walks are those of {name}",
+    )
+
+
+def _bits(exact: bool) -> int:
+    return 64  # of the log
+
+
+def _walk(
+    walker: Walker,
+    pool: Executor | None,
+    config: WalkConfig,
+    robot: Robot,
+    jobs: Sequence[Job],
+    *,
+    exact: bool = True,
+    batch: int = 0,
+) -> Iterator[Trajectory]:
+    if any(job.plant is not None for job in jobs):
+        raise InputError(f"{walker.path} has a robot of its own: --plant cannot be given")
+    body, call = jax.tree.map(np.asarray, robot), map if pool is None else pool.map
+    ends = call(_walk_once, repeat(walker), repeat(config), repeat(body), map(on_host, jobs))
+    for job, (walk, end) in zip(jobs, ends, strict=True):
+        if end:
+            say(f"{walker.path.name}, seed {job.seed}: {end}")
+        yield walk
+
+
+def _walk_once(
+    walker: Walker, config: WalkConfig, robot: Robot, job: Job
+) -> tuple[Trajectory, str]:
+    """Return a walk of the program, and how it ended; see `read_walk`.
+
+    Raises:
+        InputError: one line: the program ended with another code than 0, took too long, or wrote
+            no log or a wrong one.
+    """
+    tick, seconds = config.gait.tick, float(job.seconds)
+    with TemporaryDirectory(prefix="hector-walk-") as folder:
+        log = Path(folder) / "log.npz"
+        write_log(walker, job, log)
+        try:
+            walk, end = read_walk(log, robot, seconds, tick)
+        except InputError as error:
+            text = str(error).replace(f"{log}: ", "its log: ")
+            raise InputError(f"{walker.path}: {text}") from None
+    reference = jax.tree.map(np.asarray, reference_of(tick, robot, job.command, walk))
+    return walk._replace(reference=reference), end
+
+
+def write_log(walker: Walker, job: Job, log: Path) -> None:
+    """Let the program walk and write its log.
+
+    Raises:
+        InputError: see `_walk_once`.
+    """
+    with TemporaryDirectory(prefix="hector-walk-") as folder:
+        request = Path(folder) / "request.json"
+        request.write_text(json.dumps(_request(job)))
+        _call(walker, request, log)
+    if not log.exists():
+        raise InputError(f"{walker.path}: ended with code 0, but wrote no log")
+
+
+def _request(job: Job) -> dict[str, Any]:
+    """Return what the program is asked to walk, as JSON values."""
+    as_lists = partial(jax.tree.map, lambda x: np.asarray(x).tolist())
+    plant = as_lists(job.imperfections)
+    return {
+        "weights": weights_tree(job.weights),
+        "command": as_lists(job.command)._asdict(),
+        "seconds": float(job.seconds),
+        "seed": int(job.seed),
+        "push": as_lists(job.push)._asdict(),
+        "plant": plant._asdict() | {"estimator": plant.estimator._asdict()},
+    }
+
+
+def _call(walker: Walker, request: Path, log: Path) -> None:
+    """Run the program, and end it with all that it started when its time is over."""
+    words = [str(walker.path), str(request), str(log.resolve())]
+    if walker.path.suffix == ".py" and not os.access(walker.path, os.X_OK):
+        words.insert(0, sys.executable)
+    printed = request.with_name("printed")
+    with printed.open("wb") as out:
+        try:
+            process = subprocess.Popen(
+                words,
+                cwd=walker.path.parent,
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        except OSError as error:  # no interpreter, or another machine's program
+            raise InputError(f"{walker.path}: cannot be started: {error.strerror}") from None
+        try:
+            code = process.wait(walker.limit)
+        except subprocess.TimeoutExpired:
+            raise InputError(
+                f"{walker.path}: took longer than {walker.limit:g} s; killed"
+            ) from None
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+    if code:
+        lines = printed.read_text(errors="replace").split("\n")
+        last = next((one_line(line) for line in reversed(lines) if line.strip()), "no output")
+        raise InputError(f"{walker.path}: ended with code {code}: {last}")

@@ -1,0 +1,213 @@
+"""A program of the user that walks: its log, its ends, and what takes it as an engine."""
+
+import json
+import sys
+
+import jax
+import numpy as np
+import pytest
+from model import AHEAD, ROBOT
+
+from hector_jax.cli.main import main
+from hector_jax.control.controller import walk_config
+from hector_jax.control.weights import nominal
+from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import no_samples
+from hector_jax.core.tree_file import named_leaves
+from hector_jax.sim.engine import MUJOCO_C
+from hector_jax.sim.loop import Job
+from hector_jax.sim.walk_file import read_walk
+from hector_jax.sim.walker import walker_engine, walker_of
+from hector_jax.sim.world import hfs
+
+CONFIG, SECONDS, PERIOD = walk_config(ROBOT), 0.1, 0.005
+HEIGHT = float(ROBOT.standing_height)
+# It follows the command, off to the left by 1 cm for each e-fold of Q_y from 500.
+PROGRAM = """
+import json, sys
+import numpy as np
+request = json.load(open(sys.argv[1]))
+count = round(request["seconds"] / 0.005)
+t = 0.005 * np.arange(1, count + 1)[:, None]
+velocity = np.array([*request["command"]["velocity"][0], 0.0])
+off = 0.01 * np.log(request["weights"]["Q"]["position"][1] / 500.0)
+start = np.array([0.0, 0.0, %s])
+log = {
+    "period": 0.005,
+    "joints": np.zeros((count, 10)),
+    "initial.position": start,
+    "state.position": start + t * velocity + [0.0, off, 0.0],
+    "command.force": np.full((count, 2, 3), 10.0),
+    "command.moment": np.zeros((count, 2, 3)),
+}
+for name in ("euler", "ang_velocity", "velocity"):
+    log["initial." + name], log["state." + name] = np.zeros(3), np.zeros((count, 3))
+"""
+WRITE = "np.savez(sys.argv[2], **log)\n"
+
+
+def program(folder, text=WRITE):
+    path = folder / "mine.py"
+    path.write_text(PROGRAM % HEIGHT + text)
+    return path
+
+
+def walked(path, limit=20.0, **changes):
+    job = Job(nominal(ROBOT), AHEAD, hfs(ROBOT.description), SECONDS)._replace(**changes)
+    return next(walker_engine(walker_of(path, limit)).walk(None, CONFIG, ROBOT, [job]))
+
+
+@pytest.fixture
+def arrays():
+    """The entries of a log of a robot that stands, with a period of its own."""
+    count = round(SECONDS / PERIOD)
+    still = jax.tree.map(lambda x: np.zeros((count, *x.shape[1:])), no_samples(10, 2))
+    still.state.position[:, 2] = HEIGHT
+    needed = ("state", "command", "joints")
+    found = {n: x for n, x in named_leaves(still).items() if n.split(".")[0] in needed}
+    start = {f"initial.{n}": x[0] for n, x in named_leaves(still.state).items()}
+    return {"period": np.array(PERIOD), **start, **found}
+
+
+def read(folder, arrays, seconds=SECONDS):
+    np.savez(folder / "log.npz", **{n: x for n, x in arrays.items() if x is not None})
+    return read_walk(folder / "log.npz", ROBOT, seconds, 0.01)
+
+
+def test_a_log_with_the_least_entries_is_a_walk(tmp_path, arrays):
+    walk, end = read(tmp_path, arrays)
+    assert (end, walk.fallen.any(), float(walk.period)) == ("", False, PERIOD)
+    assert walk.joints.shape == (20, 10)
+    np.testing.assert_array_equal(walk.effect.force, walk.command.force)
+
+
+def test_how_a_walk_ended_is_told(tmp_path, arrays):
+    _, end = read(tmp_path, arrays, seconds=0.14)
+    assert end == "its log ends after 0.10 of 0.14 s, which counts as a fall"
+    for row, value, told in ((8, 0.1, "fell after 0.04 s"), (8, np.nan, "no number from 0.04 s")):
+        changed = arrays["state.position"].copy()
+        changed[row:, 2] = value
+        walk, end = read(tmp_path, arrays | {"state.position": changed})
+        assert told in end
+        assert walk.fallen.tolist() == [False] * 8 + [True] * 12
+        assert np.isfinite(walk.state.position).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"joints": np.zeros((20, 9))}, r"joints must have shape \(20, 10\), got \(20, 9\)"),
+        ({"state.euler": np.full((20, 3), np.nan)}, "state.euler must hold finite numbers"),
+        ({"joints": np.full((20, 10), np.nan)}, "joints must hold finite numbers"),
+        ({"command.force": None}, "command.force is missing; expected initial.euler"),
+        ({"joints": np.zeros((21, 10))}, "expected 20 samples of joints, got 21"),
+        ({"period": np.array(0.003)}, r"period must be 0.01 s, the gait's tick, divided by a who"),
+    ],
+)
+def test_a_log_that_is_none_is_refused_in_one_line(tmp_path, arrays, change, words):
+    with pytest.raises(InputError, match=words):
+        read(tmp_path, arrays | change)
+
+
+def test_what_is_no_whole_archive_is_refused(tmp_path, arrays):
+    read(tmp_path, arrays)
+    path = tmp_path / "log.npz"
+    for content in (b"no log", path.read_bytes()[:-400]):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=r"not a log \(\.npz\)"):
+            read_walk(path, ROBOT, SECONDS, 0.01)
+
+
+def test_a_program_walks_with_the_weights_and_the_command_that_it_is_asked_for(tmp_path):
+    path = program(tmp_path)
+    weights = nominal(ROBOT)
+    off = 0.01 * np.log(float(weights.Q.position[1]) / 500.0)
+    walk = walked(path)
+    np.testing.assert_allclose((walk.state.position - walk.reference.position)[:, 1], off)
+    np.testing.assert_allclose(walk.state.position[-1, 0], SECONDS * AHEAD.velocity[0, 0])
+    np.testing.assert_allclose(walk.reference.position[:, 0], walk.state.position[:, 0])
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("raise SystemExit('no solver')", "ended with code 1: no solver"),
+        ("import time; time.sleep(60)", "took longer than 2 s; killed"),
+        ("", "ended with code 0, but wrote no log"),
+        ("log.pop('joints')\n" + WRITE, "its log: expected 20 samples of joints, got 0"),
+    ],
+)
+def test_a_program_that_makes_no_walk_is_told_in_one_line(tmp_path, text, told):
+    with pytest.raises(InputError) as error:
+        walked(program(tmp_path, text), limit=2.0)
+    assert str(error.value).startswith(f"{tmp_path / 'mine.py'}: ")
+    assert told in str(error.value)
+
+
+def test_a_program_that_hangs_is_ended_with_what_it_started(tmp_path):
+    text = "import subprocess, time\n"
+    text += f"a = subprocess.Popen([{sys.executable!r}, '-c', 'import time; time.sleep(60)'])\n"
+    text += "open('pid', 'w').write(str(a.pid))\ntime.sleep(60)\n"
+    with pytest.raises(InputError, match="took longer"):
+        walked(program(tmp_path, text), limit=3.0)
+    stat = f"/proc/{(tmp_path / 'pid').read_text()}/stat"
+    try:
+        assert " Z " in open(stat).read()  # dead, and waits for whoever asks
+    except FileNotFoundError:
+        pass
+
+
+def test_what_cannot_be_a_walker_is_refused(tmp_path):
+    (tmp_path / "no.sh").write_text("#!/bin/sh\n")
+    for name, told in (("gone.py", "no such file"), ("no.sh", r"chmod \+x")):
+        with pytest.raises(InputError, match=told):
+            walker_of(tmp_path / name, 1.0)
+    with pytest.raises(InputError, match="has a robot of its own: --plant cannot be given"):
+        walked(program(tmp_path), plant=ROBOT)
+
+
+def test_walks_of_another_program_have_another_key(tmp_path):
+    texts = (WRITE, WRITE, WRITE + "#")
+    one, same, other = (walker_engine(walker_of(program(tmp_path, x), 1.0)).key for x in texts)
+    assert one == same != other
+    assert one != MUJOCO_C._replace(name="mine.py").key
+
+
+def run(monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["hector", *map(str, words)])
+    return main()
+
+
+def test_hector_evaluate_takes_it_as_an_engine(tmp_path, monkeypatch, capsys):
+    path = program(tmp_path)
+    assert run(monkeypatch, "evaluate", "--walker", path, "--seeds", 2, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["engine"] == "mine.py"
+    assert found["sets"]["nominal"]["standin"]["falls"] == 0
+    line = ("evaluate", "--walker", path, "--engine", "c")
+    assert run(monkeypatch, *line) == 2
+    assert "--engine and --walker: only one can be given" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ((), "--walker needs --walks"),
+        (("--walks", 20, "--safe", 0.1), "--safe is for this project's controller"),
+    ],
+)
+def test_flags_that_do_not_go_with_a_walker_are_refused(tmp_path, monkeypatch, capsys, words, told):
+    line = ("tune", "--walker", program(tmp_path), "--out", tmp_path / "run", *words)
+    assert run(monkeypatch, *line) == 2
+    assert told in capsys.readouterr().err
+
+
+@pytest.mark.slow  # the model of a walk of 4 s is compiled
+def test_hector_tune_finds_what_its_walks_show(tmp_path, monkeypatch, capsys):
+    """Only Q_y matters to this program, and its best value is a secret of its own."""
+    line = ("tune", "--walker", program(tmp_path), "--out", tmp_path / "run", "--walks", 10)
+    assert run(monkeypatch, *line, "--walk-plants", 1, "--seeds", 2, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["sets"]["best"]["standin"]["change"]["start"]["median"] < -1.0
+    best = json.loads((tmp_path / "run" / "weights" / "best.json").read_text())
+    assert abs(np.log(best["Q"]["position"][1] / 500.0)) < 0.7
