@@ -38,7 +38,6 @@ def named_file(text: str) -> tuple[str, str]:
 Processes = Annotated[int, Range(1, 1024)]
 Plants = Annotated[int, Range(1, 10_000)]
 Seed = Annotated[int, SEED]
-Iterations = Annotated[int, Range(1, 10_000)]
 Seconds = Annotated[float, Range(0.01, 600)]  # at least one tick
 Footsteps = Literal["footstep_feedback", "footstep_width", "turn_lead"]
 Gains = Literal["horizontal_gain", "height_gain", "tilt_gain", "yaw_gain"]
@@ -182,7 +181,7 @@ class Tune(Configured, ByWalker, Parallel):
     # `best` has the gains of the integral action in any case
     tune: tuple[Tunables, ...] = ("weights",)
     seeds: Plants = 8  # stand-in plants to evaluate on
-    iterations: Iterations = 10  # largest number of steps of each tuning
+    iterations: Annotated[int, Range(1, 10_000)] = 10  # largest number of steps of each tuning
     variant: Variant = "residual"  # architecture of the net
     alpha: Literal["paper", "auto"] = "paper"  # loss weights; auto makes the gradient norms alike
     # price in `best` of changes of the command between switches of stance: more, smoother commands
@@ -191,15 +190,12 @@ class Tune(Configured, ByWalker, Parallel):
     # fall less under pushes; default 0.19 of the robot's height
     safe: Annotated[float | None, Range(0.001, 10)] = None
     data: Folder = Path("data")  # folder of the walks and the net, which are made if missing
-    # file of another net, instead of that in DATA
-    net: Annotated[Path | None, PathKind.FILE] = None
+    net: Annotated[Path | None, PathKind.FILE] = None  # another net, instead of that in DATA
     runs: Folder = Path("runs")  # the run folder is RUNS/TRAJ/TIME
     out: Path | None = None  # the run folder itself, which must not exist (with --each: OUT/TRAJ)
-    # continue the interrupted run in this folder
-    resume: Annotated[Path | None, PathKind.RUN] = None
+    resume: Annotated[Path | None, PathKind.RUN] = None  # interrupted run folder to continue
     video: bool = True  # make a film of the nominal and the best weights
-    # print up to 12 walks more: in other engines, or else with other masses of the robot
-    verdict: bool = False
+    verdict: bool = False  # print up to 12 walks more: in other engines, or with other masses
     # walks to spend on tuning row `best` further, on the walks themselves (docs/howto/walks.md)
     walks: Annotated[int, Range(0, 100_000)] = 0
     walk_plants: Annotated[int, Range(0, 1000)] = 2  # drawn plants of these walks; 0: the simulator
@@ -247,8 +243,7 @@ class Search(Configured, ForRobot, Parallel, Printed):
     budget: Annotated[int, Range(1, 1_000_000)] = 200  # most walks per trajectory
     population: Annotated[int, Range(4, 10_000)] = 10  # walks in a generation
     seed: Seed = 0  # seed of the search
-    # initial standard deviation of each log-weight
-    spread: Annotated[float, Range(0, 10, above=True)] = 1.0
+    spread: Annotated[float, Range(0, 10, above=True)] = 1.0  # first deviation of log-weights
     start: Weights = "nominal"  # nominal, expert, best or a weights file
     engine: Engine = "auto"  # c: MuJoCo, one walk per process; mjx: all at once; auto: mjx on a GPU
     out: Folder = Path("runs/search")  # folder for the best weights, each with a card
@@ -357,8 +352,7 @@ class Export(Printed):
     run: Annotated[Path, PathKind.EXPORTABLE]  # run folder, `latest`, or a weights file
     set: str = "best"  # weight set of the run
     out: Path | None = None  # folder; by default `export` in the run or beside the weights file
-    # trajectory to check on; by default that of the run, or straight
-    traj: Annotated[str | None, PathKind.TRAJECTORY] = None
+    traj: Annotated[str | None, PathKind.TRAJECTORY] = None  # of the check; by default the run's
     seconds: Seconds = 1.0  # length of that walk after the start-up [s]
     robot: RobotFile = None  # TOML file of the robot of a weights file; HECTOR by default
 

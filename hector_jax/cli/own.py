@@ -49,59 +49,60 @@ def tune_own(folder: Path, args: Tune) -> None:
     trajectories = run_folder.trajectories(args, robot)
     config = tunings.tune_config(robot, others=model_numbers(args.tune))
     config = arguments.with_length(config, trajectories[0])
-    seconds = trajectories[0].seconds or config.rollout.ticks * config.rollout.walk.gait.tick
-    commands = {name: command for name, command, _ in trajectories}
-    start, engine = arguments.weights_by_name(args.start, robot), arguments.engine_of(args)
-    plants = choice.drawn_plants(robot, args.walk_plants) or [hfs(robot.description)]
-    seeds, first = range(args.seeds), trajectories[0]
-    log = folder / "first.npz"
-    if args.walker and not log.exists():
-        walker = walker_of(args.walker, args.walker_limit)
-        write_log(walker, Job(start, first.command, plants[0], seconds), log)
-    tick = config.rollout.walk.gait.tick
-    for line in check_log(read_check(log, robot, first.command, seconds, tick)[0], tick):
-        say(f"before any tuning, {first.name}: {line}")
+    seconds = config.rollout.ticks * config.rollout.walk.gait.tick
+    campaign = Campaign(
+        folder / "walks",
+        config,
+        robot,
+        arguments.weights_by_name(args.start, robot),
+        {trajectory.name: trajectory.command for trajectory in trajectories},
+        choice.drawn_plants(robot, args.walk_plants) or [hfs(robot.description)],
+        leg_numbers=leg_numbers(args.tune),
+        engine=arguments.engine_of(args),
+    )
+    _check_first(folder / "first.npz", args, campaign, seconds)
     with workers(args.processes) as pool:
-        campaign = Campaign(
-            folder / "walks",
-            config,
-            robot,
-            start,
-            commands,
-            plants,
-            leg_numbers=leg_numbers(args.tune),
-            engine=engine,
-        )
         rows = tune_on_walks(pool, campaign, args.walks)
         weights, number = answer(campaign, campaign_space(pool, campaign), rows)
-        sets = {"set 0": campaign.start, f"set {number}": weights}
+        sets, commands = {"set 0": campaign.start, f"set {number}": weights}, campaign.commands
         setup = Setup(pool, config, robot, made_with.get("commit", ""))
-        options = {"seconds": seconds, "folder": folder / "scores", "engine": engine}
+        options = {"seconds": seconds, "folder": folder / "scores", "engine": campaign.engine}
         chosen = choice.walks_best(setup, sets, [*commands.values()], choice.HELD_OUT, **options)
         compared = {"start": sets["set 0"], "best": sets[chosen]}
         for name, weights in compared.items():
             save_weights(folder / "weights" / f"{name}.json", weights)
+        seeds = range(args.seeds)
         drawn = arguments.plants("standin", seeds, robot.description)
         judge = partial(judging.judge, setup, compared, plants=drawn, seeds=seeds, **options)
         title = f"evaluating on {plural(len(seeds), 'plant')}"
         scores = {n: judge(command=c, title=f"{title}, {n}").scores for n, c in commands.items()}
-    verdicts = {", ".join(commands): metrics.make_verdict(config.loss, seeds, scores)}
-    by_name = {
-        name: metrics.make_verdict(config.loss, seeds, {name: scores[name]}) for name in commands
-    }
+    verdicts = {", ".join(scores): scores} | {name: {name: scores[name]} for name in scores}
+    verdicts = {n: metrics.make_verdict(config.loss, seeds, s) for n, s in verdicts.items()}
     result = {
-        **metrics.verdict_result(next(iter(verdicts.values()))),
-        "trajectories": {name: metrics.verdict_result(by_name[name]) for name in commands},
+        **metrics.verdict_result(verdicts[", ".join(scores)]),
+        "trajectories": {name: metrics.verdict_result(verdicts[name]) for name in scores},
         "walks": [change._asdict() for change in changes_by_walk(rows)],
         "chosen": chosen,
     }
     write_json(folder / RESULT, result)
 
     def print_text() -> None:
-        for name, verdict in (verdicts | by_name).items():
-            print_table(verdict, f"{name}, {plural(len(seeds), 'plant')}", engine.title)
+        for name, verdict in verdicts.items():
+            print_table(verdict, f"{name}, {plural(len(seeds), 'plant')}", campaign.engine.title)
 
     print_result(args.json, {"run": str(folder), **result}, print_text)
     if chosen == "set 0":
         say("on plants that were not walked nothing is better than the start: `best` is the start")
     say(f"the weights are {folder / 'weights' / 'best.json'}")
+
+
+def _check_first(log: Path, args: Tune, campaign: Campaign, seconds: float) -> None:
+    """Walk once with the weights at the start, and say what no weights can mend."""
+    assert args.walker is not None
+    (name, command), *_ = campaign.commands.items()
+    if not log.exists():
+        job = Job(campaign.start, command, campaign.plants[0] or hfs(), seconds)
+        write_log(walker_of(args.walker, args.walker_limit), job, log)
+    tick = campaign.config.rollout.walk.gait.tick
+    for line in check_log(read_check(log, campaign.robot, command, seconds, tick)[0], tick):
+        say(f"before any tuning, {name}: {line}")

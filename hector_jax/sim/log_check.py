@@ -33,7 +33,7 @@ UNLIKE = 0.3  # of a velocity, from the derivative of what it is the velocity of
 FOLLOWS = 0.3  # of the robot's distance from the path, that is left to a reference that follows it
 
 
-class Log(NamedTuple):
+class CheckedLog(NamedTuple):
     """A log with its robot; rows of all arrays are the settled samples before a fall."""
 
     robot: Robot
@@ -52,7 +52,7 @@ class Log(NamedTuple):
 
 def read_check(
     path: Path, robot: Robot, command: Command, seconds: float, tick: float
-) -> tuple[Log, str]:
+) -> tuple[CheckedLog, str]:
     """Read a log for `check_log`; returns also how the walk ended.
 
     Raises:
@@ -79,10 +79,10 @@ def read_check(
     stance = walk.contact if walk.contact.any() else loaded
     jumps = np.flatnonzero(np.abs(np.diff(whole.state.euler[:, 2])) > np.pi)
     jump = period * (1 + float(jumps[0])) if len(jumps) else None
-    return Log(robot, walk, own, share, "effect.force" in names, jump, stance), end
+    return CheckedLog(robot, walk, own, share, "effect.force" in names, jump, stance), end
 
 
-def check_log(log: Log, tick: float) -> list[str]:
+def check_log(log: CheckedLog, tick: float) -> list[str]:
     """Return a line for each fault that no weight can mend, what to look at first in front.
 
     Args:
@@ -106,7 +106,7 @@ def _middle(x: np.ndarray, period: float) -> np.ndarray:
     return (sums[span:] - sums[:-span]) / span
 
 
-def _velocities(log: Log, tick: float) -> Iterator[str]:
+def _velocities(log: CheckedLog, tick: float) -> Iterator[str]:
     """Is each velocity the derivative of what it is the velocity of, in the world?"""
     state, period = log.walk.state, float(log.walk.period)
     if log.yaw_jump is not None:
@@ -138,7 +138,7 @@ def _velocities(log: Log, tick: float) -> Iterator[str]:
         yield f"{name} is {100 * as_is:.0f} % off the derivative of the pose{cause}"
 
 
-def _sliding(log: Log, joints: Float[np.ndarray, "n joints"]) -> tuple[float, float]:
+def _sliding(log: CheckedLog, joints: Float[np.ndarray, "n joints"]) -> tuple[float, float]:
     """Return the speed of the feet that stand [m/s], RMS, and their mean height [m]."""
     state, period, robot = log.walk.state, float(log.walk.period), log.robot
     R = np.asarray(jax.vmap(rotation_from_euler)(state.euler))
@@ -154,7 +154,7 @@ def _sliding(log: Log, joints: Float[np.ndarray, "n joints"]) -> tuple[float, fl
     return float(np.sqrt(np.mean(inner**2))) if len(inner) else 0.0, float(np.mean(heights))
 
 
-def _legs(log: Log, tick: float) -> Iterator[str]:
+def _legs(log: CheckedLog, tick: float) -> Iterator[str]:
     """Do feet that stand stay where the joints say that they are?"""
     joints, legs = log.walk.joints, log.stance.shape[1]
     by_leg = joints.reshape(len(joints), legs, -1)
@@ -189,7 +189,7 @@ def _legs(log: Log, tick: float) -> Iterator[str]:
         )
 
 
-def _loads(log: Log, tick: float) -> Iterator[str]:
+def _loads(log: CheckedLog, tick: float) -> Iterator[str]:
     """Is the mass that of the file, and does the robot stand at its height?"""
     force = (log.walk.effect if log.has_effect else log.walk.command).force[..., 2].sum(axis=1)
     share = float(np.mean(force)) / log.weight
@@ -203,7 +203,7 @@ def _loads(log: Log, tick: float) -> Iterator[str]:
     yield from steady_height(log.walk, np.ones(len(log.stance), bool))
 
 
-def _ground(log: Log, tick: float) -> Iterator[str]:
+def _ground(log: CheckedLog, tick: float) -> Iterator[str]:
     """Does the ground return what was commanded, and when?"""
     if not log.has_effect:
         return
@@ -224,7 +224,7 @@ def _ground(log: Log, tick: float) -> Iterator[str]:
         yield f"the ground's force is {gain:.2f} times the commanded one: torques or their units"
 
 
-def _air(log: Log, tick: float) -> Iterator[str]:
+def _air(log: CheckedLog, tick: float) -> Iterator[str]:
     """Are feet in the air free of commanded forces?"""
     force = np.linalg.norm(log.walk.command.force, axis=-1)[~log.stance]
     if log.walk.contact.any() and len(force) and force.mean() > IN_AIR * log.weight:
@@ -234,14 +234,14 @@ def _air(log: Log, tick: float) -> Iterator[str]:
         )
 
 
-def _torques(log: Log, tick: float) -> Iterator[str]:
+def _torques(log: CheckedLog, tick: float) -> Iterator[str]:
     """Are motors at their limits?"""
     if log.torque is not None:
         rows = np.ones(len(log.torque), bool)
         yield from lasting(motors(log.robot, log.torque), rows, MOST_AT_LIMIT, "the time")
 
 
-def _reference(log: Log, tick: float) -> Iterator[str]:
+def _reference(log: CheckedLog, tick: float) -> Iterator[str]:
     """Does the controller know where it should be?"""
     if log.own is None:
         return
@@ -255,7 +255,7 @@ def _reference(log: Log, tick: float) -> Iterator[str]:
         )
 
 
-def _plans(log: Log, tick: float) -> Iterator[str]:
+def _plans(log: CheckedLog, tick: float) -> Iterator[str]:
     """How often does it plan, and are plans solved?"""
     force, period = log.walk.command.force.reshape(len(log.stance), -1), float(log.walk.period)
     changes = np.flatnonzero(np.any(np.diff(force, axis=0) != 0.0, axis=1))
