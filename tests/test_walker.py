@@ -211,3 +211,6 @@ def test_hector_tune_finds_what_its_walks_show(tmp_path, monkeypatch, capsys):
     assert found["sets"]["best"]["standin"]["change"]["start"]["median"] < -1.0
     best = json.loads((tmp_path / "run" / "weights" / "best.json").read_text())
     assert abs(np.log(best["Q"]["position"][1] / 500.0)) < 0.7
+    for words in (("view", tmp_path / "run", "--headless"), ("export", tmp_path / "run")):
+        assert run(monkeypatch, *words) == 2
+        assert f"its walks are those of {tmp_path / 'mine.py'}" in capsys.readouterr().err

@@ -216,8 +216,8 @@ def run_export(args: flags.Export) -> None:
     is_run = args.run.is_dir()
     if is_run and args.robot:
         raise InputError(f"--robot is for weights files; the run {args.run} names its own robot")
-    path, config = export.find_weights(args.run, args.set)
     request = read_request(args.run) if is_run else None
+    path, config = export.find_weights(args.run, args.set)
     robot = arguments.robot_of_run(args.run, request) if request else load_robot(args.robot)
     text = args.traj or (request.trajectory if request else "straight")
     trajectory = arguments.load_trajectory(text, robot)

@@ -33,7 +33,7 @@ from hector_jax.core.settings import convert, read_json
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.difftune import Iteration
 from hector_jax.tuning.evaluate import Evaluation
-from hector_jax.tuning.loss import Loss, with_alphas
+from hector_jax.tuning.loss import Loss, named_loss
 from hector_jax.tuning.status import status_of
 
 CONFIG, METRICS, RESULT, VERSIONS = "config.json", "metrics.jsonl", "result.json", "versions.json"
@@ -83,12 +83,15 @@ def read_request(folder: Path) -> RunRequest:
         InputError: the folder is not the folder of a run.
     """
     config = read_object(folder / CONFIG)
+    if isinstance(flags := config.get("flags"), dict) and flags.get("walker"):
+        text = f"its walks are those of {flags['walker']}, its weights are in {folder}/weights"
+        raise InputError(f"{folder}: {text}")
     try:
         # a run that has just begun has written only its flags
         flags, loss = config["flags"], config.get("tune", {}).get("loss", {})
         return RunRequest(
             trajectory=convert(flags["traj"], tuple[str, ...], name="traj")[0],
-            loss=with_alphas(loss),
+            loss=named_loss(loss),
             data=Path(flags["data"]),
             net=flags["net"] and Path(flags["net"]),
             variant=str(flags["variant"]),

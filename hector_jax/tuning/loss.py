@@ -237,15 +237,26 @@ def smoother(loss: Loss, price: float) -> Loss:
     return (*loss, *added)
 
 
+def named_loss(weights: Mapping[str, Any]) -> Loss:
+    """Return the paper's loss with other weights, and the optional terms that have one.
+
+    Raises:
+        InputError: see `with_alphas`.
+
+    >>> [term.name for term in named_loss({"L_pos": 0.0, "L_vel": 1e5})]
+    ['L_Eul', 'L_pos', 'L_ctrl', 'L_vel']
+    """
+    added = tuple(term for term in OPTIONAL_TERMS if term.name in weights)
+    return with_alphas(weights, PAPER_LOSS + added)
+
+
 def loss_of_robot(description: Description) -> Loss:
     """Return the paper's loss with the weights of a robot's description, and terms that it adds.
 
     Raises:
         InputError: one line naming the file, for an unknown term or a wrong weight.
     """
-    weights = dict(description.loss)
-    added = tuple(term for term in OPTIONAL_TERMS if term.name in weights)
     try:
-        return with_alphas(weights, PAPER_LOSS + added)
+        return named_loss(dict(description.loss))
     except InputError as error:
         raise InputError(f"{description.path}: loss: {error}") from None
