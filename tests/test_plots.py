@@ -69,21 +69,6 @@ def test_sets_are_not_drawn_alike_and_stay_apart_in_grey():
     assert np.diff(greys).min() > 0.12
 
 
-def test_a_straight_path_is_flat_with_room_for_its_legend_and_labels(tmp_path, drawn):
-    """Also with the many names of four feet."""
-    walk = pretend_walk(seconds=4.0)
-    more = {name: np.repeat(getattr(walk, name), 2, axis=1) for name in ("contact", "feet")}
-    names = ("nominal", "expert", "with", "best")
-    plots.save_path(tmp_path / "path.png", dict.fromkeys(names, walk._replace(**more)))
-    (figure,) = drawn
-    (axes,) = figure.axes
-    assert figure.bbox.height < figure.bbox.width / 2
-    for text in (axes.xaxis.label, axes.yaxis.label, *figure.legends):
-        box = text.get_window_extent()
-        assert box.y0 >= 0.0
-        assert box.y1 <= figure.bbox.y1
-
-
 def test_the_loss_by_iteration_shows_refused_steps_that_are_no_numbers(tmp_path, drawn):
     histories = {"without": pretend_history(12), "with": pretend_history(8, refused=(3, 5))}
     plots.save_losses(tmp_path / "loss.png", PAPER_LOSS, histories)

@@ -1,13 +1,10 @@
-"""Rivals on a bowl in place of a simulator, and the contests of the race."""
+"""The rivals of the race, on a bowl in place of a simulator."""
 
 from importlib.util import find_spec
 
-import jax
 import numpy as np
 import pytest
 from rivals import RIVALS, Spent, Task
-
-from hector_jax.robot.model import load_robot
 
 SIZE = 6
 GOAL = np.linspace(-1.0, 1.0, SIZE)
@@ -18,7 +15,7 @@ def bowl(point):
     return float(np.log(1.0 + np.sum((point - GOAL) ** 2)))
 
 
-def walked_by(name, seed=1, budget=60, loss=bowl, box=2.0):
+def walked_by(name, budget=60):
     """Return the points that a rival walks, and their losses."""
     if not find_spec(NEEDS.get(name, "cmaes")):
         pytest.skip(f"{NEEDS[name]} is not installed")
@@ -28,13 +25,13 @@ def walked_by(name, seed=1, budget=60, loss=bowl, box=2.0):
         if len(points) == budget:
             raise Spent
         points.append(np.array(point))
-        losses.append(loss(points[-1]))
+        losses.append(bowl(points[-1]))
         return losses[-1]
 
     rough = 0.5 * GOAL + 0.3 * np.random.default_rng(0).standard_normal((200, SIZE))
     source = rough, np.array([bowl(point) for point in rough])
     with pytest.raises(Spent):
-        RIVALS[name](Task(walk, np.tile([-box, box], (SIZE, 1)), 0.5, seed, source))
+        RIVALS[name](Task(walk, np.tile([-2.0, 2.0], (SIZE, 1)), 0.5, 1, source))
     return np.array(points), np.array(losses)
 
 
@@ -44,8 +41,3 @@ def test_a_rival_goes_downhill_within_its_box_and_repeats_itself(name):
     assert losses.min() < 0.95 * bowl(np.zeros(SIZE))
     assert np.abs(points).max() <= 2.0 + 1e-9
     np.testing.assert_array_equal(walked_by(name, budget=20)[0], points[:20])
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return jax.tree.map(np.asarray, load_robot())

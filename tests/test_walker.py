@@ -2,6 +2,7 @@
 
 import json
 import sys
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -10,7 +11,7 @@ from model import AHEAD, ROBOT
 
 from hector_jax.cli.main import main
 from hector_jax.control.controller import walk_config
-from hector_jax.control.weights import nominal
+from hector_jax.control.weights import expert, nominal
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import named_leaves
@@ -20,6 +21,7 @@ from hector_jax.sim.walk_file import read_walk
 from hector_jax.sim.walker import walker_engine, walker_of
 from hector_jax.sim.world import hfs
 
+ROOT = Path(__file__).parents[1]
 CONFIG, SECONDS, PERIOD = walk_config(ROBOT), 0.1, 0.005
 HEIGHT = float(ROBOT.standing_height)
 # It follows the command, off to the left by 1 cm for each e-fold of Q_y from 500.
@@ -59,7 +61,6 @@ def walked(path, limit=20.0, **changes):
 
 @pytest.fixture
 def arrays():
-    """The entries of a log of a robot that stands, with a period of its own."""
     count = round(SECONDS / PERIOD)
     still = jax.tree.map(lambda x: np.zeros((count, *x.shape[1:])), no_samples(10, 2))
     still.state.position[:, 2] = HEIGHT
@@ -74,8 +75,10 @@ def read(folder, arrays, seconds=SECONDS):
     return read_walk(folder / "log.npz", ROBOT, seconds, 0.01)
 
 
-def test_a_log_with_the_least_entries_is_a_walk(tmp_path, arrays):
+def test_a_log_with_the_least_entries_is_a_walk_and_its_yaw_goes_on(tmp_path, arrays):
+    arrays["state.euler"][5:, 2] += 2.0 * np.pi
     walk, end = read(tmp_path, arrays)
+    assert np.abs(walk.state.euler).max() < 1e-9
     assert (end, walk.fallen.any(), float(walk.period)) == ("", False, PERIOD)
     assert walk.joints.shape == (20, 10)
     np.testing.assert_array_equal(walk.effect.force, walk.command.force)
@@ -101,6 +104,7 @@ def test_how_a_walk_ended_is_told(tmp_path, arrays):
         ({"joints": np.full((20, 10), np.nan)}, "joints must hold finite numbers"),
         ({"command.force": None}, "command.force is missing; expected initial.euler"),
         ({"joints": np.zeros((21, 10))}, "expected 20 samples of joints, got 21"),
+        ({"contact": np.full((20, 2), 0.5)}, "contact must hold zeros and ones"),
         ({"period": np.array(0.003)}, r"period must be 0.01 s, the gait's tick, divided by a who"),
     ],
 )
@@ -144,6 +148,14 @@ def test_a_program_that_makes_no_walk_is_told_in_one_line(tmp_path, text, told):
     assert told in str(error.value)
 
 
+def test_in_a_tuning_a_walk_that_is_not_made_is_a_fall(tmp_path, capsys):
+    walker = walker_of(program(tmp_path, "raise SystemExit('no solver')"), 20.0, strict=False)
+    job = Job(nominal(ROBOT), AHEAD, hfs(ROBOT.description), SECONDS)
+    walk = next(walker_engine(walker).walk(None, CONFIG, ROBOT, [job]))
+    assert walk.fallen.all()
+    assert "ended with code 1: no solver; counts as a fall" in capsys.readouterr().err
+
+
 def test_a_program_that_hangs_is_ended_with_what_it_started(tmp_path):
     text = "import subprocess, time\n"
     text += f"a = subprocess.Popen([{sys.executable!r}, '-c', 'import time; time.sleep(60)'])\n"
@@ -171,6 +183,17 @@ def test_walks_of_another_program_have_another_key(tmp_path):
     one, same, other = (walker_engine(walker_of(program(tmp_path, x), 1.0)).key for x in texts)
     assert one == same != other
     assert one != MUJOCO_C._replace(name="mine.py").key
+
+
+def test_the_example_walks_by_a_controller_of_its_own():
+    weights, path = expert(ROBOT), ROOT / "examples" / "own_controller" / "walker.py"
+    plant = hfs(ROBOT.description)._replace(mass=np.ones(()))
+    walk = walked(path, weights=weights, imperfections=plant, seconds=1.0)
+    assert not walk.fallen.any()
+    assert walk.contact.sum(axis=1).max() == 1  # one foot after the other
+    assert 0.2 < walk.state.position[-1, 0] - walk.initial.position[0] < 0.6
+    weight = float(ROBOT.mass * ROBOT.gravity[2])
+    assert walk.effect.force[..., 2].sum(axis=1).mean() == pytest.approx(weight, rel=0.1)
 
 
 def run(monkeypatch, *words):
@@ -204,7 +227,6 @@ def test_flags_that_do_not_go_with_a_walker_are_refused(tmp_path, monkeypatch, c
 
 @pytest.mark.slow  # the model of a walk of 4 s is compiled
 def test_hector_tune_finds_what_its_walks_show(tmp_path, monkeypatch, capsys):
-    """Only Q_y matters to this program, and its best value is a secret of its own."""
     line = ("tune", "--walker", program(tmp_path), "--out", tmp_path / "run", "--walks", 10)
     assert run(monkeypatch, *line, "--walk-plants", 1, "--seeds", 2, "--json") == 0
     found = json.loads(capsys.readouterr().out)

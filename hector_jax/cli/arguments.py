@@ -58,7 +58,12 @@ def engine_of(args: Evaluate | Tune | Verdict | Walk) -> Engine:
         return choose_engine(getattr(args, flag))
     if args.is_given(flag):
         raise InputError(f"--{flag.replace('_', '-')} and --walker: only one can be given")
-    return walker_engine(walker_of(args.walker, args.walker_limit))
+    for name in ("gait", "light_heavy", "plant"):
+        if hasattr(args, name) and args.is_given(name):
+            text = f"--{name.replace('_', '-')} is for this project's controller and simulators"
+            raise InputError(f"{text}, so not beside --walker")
+    strict = not isinstance(args, Tune)  # a tuning goes on over night
+    return walker_engine(walker_of(args.walker, args.walker_limit, strict=strict))
 
 
 def short_names(texts: Sequence[str]) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.arguments import print_result
@@ -12,7 +13,7 @@ from hector_jax.control.weights_file import save_weights
 from hector_jax.core.console import say
 from hector_jax.core.environment import environment
 from hector_jax.core.files import write_json
-from hector_jax.core.inputs import plural
+from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
 from hector_jax.report.report import print_table
 from hector_jax.robot.model import load_robot
@@ -60,7 +61,7 @@ def tune_own(folder: Path, args: Tune) -> None:
         leg_numbers=leg_numbers(args.tune),
         engine=arguments.engine_of(args),
     )
-    _check_first(folder / "first.npz", args, campaign, seconds)
+    _check_first(args, campaign, seconds)
     with workers(args.processes) as pool:
         rows = tune_on_walks(pool, campaign, args.walks)
         weights, number = answer(campaign, campaign_space(pool, campaign), rows)
@@ -76,19 +77,19 @@ def tune_own(folder: Path, args: Tune) -> None:
         judge = partial(judging.judge, setup, compared, plants=drawn, seeds=seeds, **options)
         title = f"evaluating on {plural(len(seeds), 'plant')}"
         scores = {n: judge(command=c, title=f"{title}, {n}").scores for n, c in commands.items()}
-    verdicts = {", ".join(scores): scores} | {name: {name: scores[name]} for name in scores}
-    verdicts = {n: metrics.make_verdict(config.loss, seeds, s) for n, s in verdicts.items()}
+    verdict = partial(metrics.make_verdict, config.loss, seeds)
+    whole, by_name = verdict(scores), {name: verdict({name: scores[name]}) for name in scores}
     result = {
-        **metrics.verdict_result(verdicts[", ".join(scores)]),
-        "trajectories": {name: metrics.verdict_result(verdicts[name]) for name in scores},
+        **metrics.verdict_result(whole),
+        "trajectories": {name: metrics.verdict_result(by_name[name]) for name in by_name},
         "walks": [change._asdict() for change in changes_by_walk(rows)],
         "chosen": chosen,
     }
     write_json(folder / RESULT, result)
 
     def print_text() -> None:
-        for name, verdict in verdicts.items():
-            print_table(verdict, f"{name}, {plural(len(seeds), 'plant')}", campaign.engine.title)
+        for name, of in ({", ".join(by_name): whole} | by_name).items():
+            print_table(of, f"{name}, {plural(len(seeds), 'plant')}", campaign.engine.title)
 
     print_result(args.json, {"run": str(folder), **result}, print_text)
     if chosen == "set 0":
@@ -96,13 +97,18 @@ def tune_own(folder: Path, args: Tune) -> None:
     say(f"the weights are {folder / 'weights' / 'best.json'}")
 
 
-def _check_first(log: Path, args: Tune, campaign: Campaign, seconds: float) -> None:
+def _check_first(args: Tune, campaign: Campaign, seconds: float) -> None:
     """Walk once with the weights at the start, and say what no weights can mend."""
     assert args.walker is not None
     (name, command), *_ = campaign.commands.items()
-    if not log.exists():
-        job = Job(campaign.start, command, campaign.plants[0] or hfs(), seconds)
-        write_log(walker_of(args.walker, args.walker_limit), job, log)
+    job = Job(campaign.start, command, campaign.plants[0] or hfs(), seconds)
     tick = campaign.config.rollout.walk.gait.tick
-    for line in check_log(read_check(log, campaign.robot, command, seconds, tick)[0], tick):
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "first.npz"
+        write_log(walker_of(args.walker, args.walker_limit), job, path)
+        try:
+            log, end = read_check(path, campaign.robot, command, seconds, tick)
+        except InputError as error:
+            raise InputError(str(error).replace(str(path), f"{args.walker}: its log")) from None
+    for line in [*([end] if end else []), *check_log(log, tick)]:
         say(f"before any tuning, {name}: {line}")

@@ -33,8 +33,7 @@ _CODE = (*COLLECTION_CODE, "grfm.training", "sim.standin", "verdict.choice", "wa
 _CALL_FLAGS = ("config", "each", "out", "resume", "runs")
 # flags that may change when a run is resumed
 _FREE_FLAGS = ("data", "json", "processes", "verdict", "video")
-
-
+# flags that say nothing to a program of the user
 _OF_OUR_CONTROLLER = "alpha data iterations net safe smooth variant verdict".split()
 
 
@@ -76,6 +75,8 @@ def _check_walker(args: Tune) -> None:
         return
     if not args.walks:
         raise InputError("--walker needs --walks, the number of its walks that a tuning may take")
+    if args.tune != ("weights",):
+        raise InputError(f"--tune must be weights beside --walker, got {' '.join(args.tune)}")
     if given := [name for name in _OF_OUR_CONTROLLER if args.is_given(name)]:
         flag = given[0].replace("_", "-")
         raise InputError(f"--{flag} is for this project's controller, so not beside --walker")

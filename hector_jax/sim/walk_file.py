@@ -21,6 +21,8 @@ from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 
 _NEEDED = ("initial.", "state.", "command.", "joints")
+FLAGS = ("contact", "fallen", "legs_touch")
+"""Entries of zeros and ones."""
 
 
 def read_walk(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Trajectory, str]:
@@ -50,7 +52,8 @@ def read_walk(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Tr
     if not _divides(period := arrays["period"], tick):
         text = f"must be {tick} s, the gait's tick, divided by a whole number"
         raise InputError(f"{path}: period {text}, got {period}")
-    wanted = round(seconds / float(period))
+    period = tick / round(tick / float(period))
+    wanted = round(seconds / period)
     count = next(iter(arrays.get("joints", np.zeros(())).shape), 0)
     if not 1 <= count <= wanted:
         raise InputError(f"{path}: expected {wanted} samples of joints, got {count}")
@@ -60,20 +63,24 @@ def read_walk(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Tr
     for name, x in named_leaves(walk).items():
         if not np.isfinite(x[: max(valid, 1)] if np.ndim(x) and len(x) == count else x).all():
             raise InputError(f"{path}: {name} must hold finite numbers")
-    if (angle := np.abs(walk.state.euler[:valid, :2]).max(initial=0.0)) > np.pi:
-        raise InputError(f"{path}: roll or pitch reaches {angle:.3g}, expected radians")
+    upright = walk.state.position[:valid, 2] >= robot.description.limits[0]
+    if (angle := np.abs(walk.state.euler[:valid, :2][upright]).max(initial=0.0)) > np.pi:
+        raise InputError(f"{path}: roll or pitch reaches {angle:.3g} at full height: in degrees?")
     rows = np.minimum(np.arange(wanted), valid - 1)
     samples = jax.tree.map(lambda x: x[rows], walk._replace(period=None, initial=None))
     down = np.asarray(has_fallen(samples.state, *robot.description.limits))
     fallen = np.maximum.accumulate(down | samples.fallen) | (np.arange(wanted) >= valid)
-    upright = float(period) * (wanted if not fallen.any() else int(np.argmax(fallen)))
-    end = f"fell after {upright:.2f} s" if fallen.any() else ""
-    if end and valid < count:
-        end = f"its state is no number from {upright:.2f} s on, which counts as a fall"
-    elif end and upright == float(period) * count:
-        end = f"its log ends after {upright:.2f} of {seconds:g} s, which counts as a fall"
-    walk = samples._replace(period=np.asarray(period, float), initial=walk.initial, fallen=fallen)
-    return walk, end
+    stood = int(np.argmax(fallen)) if fallen.any() else wanted
+    end = "" if stood == wanted else f"fell after {period * stood:.2f} s"
+    if end and stood == valid < count:
+        end = f"its state is no number from {period * stood:.2f} s on, which counts as a fall"
+    elif end and stood == count:
+        end = f"its log ends after {period * stood:.2f} of {seconds:g} s, which counts as a fall"
+    yaw = np.unwrap(np.append(walk.initial.euler[2], samples.state.euler[:, 2]))[1:]
+    euler = np.column_stack([samples.state.euler[:, :2], yaw])
+    state = samples.state._replace(euler=euler)
+    initial, period = walk.initial, np.asarray(period)
+    return samples._replace(period=period, initial=initial, state=state, fallen=fallen), end
 
 
 def _divides(period: np.ndarray, tick: float) -> bool:
@@ -96,8 +103,9 @@ def _checked(path: Path, arrays: dict[str, Any], empty: Trajectory, count: int) 
             raise InputError(f"{path}: {name} must have shape {shape}, got {got}")
         if found[name].dtype.kind not in "biuf":
             raise InputError(f"{path}: {name} must hold finite numbers")
-        flags = name in ("contact", "fallen", "legs_touch")
-        found[name] = found[name].astype(bool if flags else float)
+        if name in FLAGS and not np.isin(found[name], (0, 1)).all():
+            raise InputError(f"{path}: {name} must hold zeros and ones")
+        found[name] = found[name].astype(bool if name in FLAGS else float)
     return jax.tree.unflatten(jax.tree.structure(empty), list(found.values()))
 
 

@@ -1,6 +1,6 @@
 """A program of the user that walks, with his own controller in his own simulator, as an engine.
 
-For each walk it is called, in its folder and in an environment of its own, as
+For each walk it is called in its folder, several at once, as
 
     FILE request.json log.npz
 
@@ -14,7 +14,6 @@ with code 0.
 import hashlib
 import json
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -32,12 +31,12 @@ from hector_jax.control.controller import WalkConfig
 from hector_jax.control.weights_file import weights_tree
 from hector_jax.core.console import say
 from hector_jax.core.inputs import InputError, one_line
-from hector_jax.core.trajectory import Trajectory
+from hector_jax.core.trajectory import Trajectory, no_samples
 from hector_jax.robot.model import Robot
 from hector_jax.sim.engine import Engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
-from hector_jax.sim.walk_file import read_walk, reference_of
+from hector_jax.sim.walk_file import FLAGS, read_walk, reference_of
 
 
 class Walker(NamedTuple):
@@ -45,15 +44,17 @@ class Walker(NamedTuple):
 
     path: Path
     limit: float  # [s] of a walk
-    content: str  # hash of the file, which tells its walks from those of another one
+    content: str  # hash of it and of Python files beside it: tells its walks from those of others
+    strict: bool  # a walk that the program does not make is an error, else a fall
 
 
-def walker_of(path: Path, limit: float) -> Walker:
+def walker_of(path: Path, limit: float, *, strict: bool = True) -> Walker:
     """Return the walker of a file.
 
     Args:
         path: an executable file, or a Python file, which this interpreter runs.
         limit: longest time that it may take for a walk [s].
+        strict: a walk that the program does not make is an error; else it counts as a fall.
 
     Raises:
         InputError: there is no such file, or it cannot be executed.
@@ -63,7 +64,9 @@ def walker_of(path: Path, limit: float) -> Walker:
         raise InputError(f"walker {path}: no such file")
     if path.suffix != ".py" and not os.access(path, os.X_OK):
         raise InputError(f"walker {path}: expected a Python file or an executable one (chmod +x)")
-    return Walker(path, limit, hashlib.sha256(path.read_bytes()).hexdigest()[:16])
+    files = sorted({path, *path.parent.glob("*.py")})
+    content = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
+    return Walker(path, limit, content, strict)
 
 
 def walker_engine(walker: Walker) -> Engine:
@@ -115,14 +118,25 @@ def _walk_once(
     tick, seconds = config.gait.tick, float(job.seconds)
     with TemporaryDirectory(prefix="hector-walk-") as folder:
         log = Path(folder) / "log.npz"
-        write_log(walker, job, log)
         try:
+            write_log(walker, job, log)
             walk, end = read_walk(log, robot, seconds, tick)
         except InputError as error:
-            text = str(error).replace(f"{log}: ", "its log: ")
-            raise InputError(f"{walker.path}: {text}") from None
+            text = str(error).replace(f"{log}: ", f"{walker.path}: its log: ")
+            if walker.strict:
+                raise InputError(text) from None
+            walk, end = _not_walked(robot, seconds, tick), f"{text}; counts as a fall"
     reference = jax.tree.map(np.asarray, reference_of(tick, robot, job.command, walk))
     return walk._replace(reference=reference), end
+
+
+def _not_walked(robot: Robot, seconds: float, tick: float) -> Trajectory:
+    """Return a walk of a robot that lies on the floor."""
+    empty = no_samples(len(robot.joint_lower), len(robot.foot_point))
+    count = round(seconds / tick)
+    down = jax.tree.map(lambda x: np.zeros((count, *x.shape[1:]), x.dtype), empty)
+    flags = {name: np.full_like(getattr(down, name), name == "fallen", bool) for name in FLAGS}
+    return down._replace(period=np.asarray(tick), initial=empty.initial, **flags)
 
 
 def write_log(walker: Walker, job: Job, log: Path) -> None:
@@ -153,35 +167,49 @@ def _request(job: Job) -> dict[str, Any]:
     }
 
 
+# Starts a program in a session of its own, and ends it with all that it started: at its end, after
+# a time limit, and if the process that waits for it was killed. Code 124 tells the limit.
+_SUPERVISOR = """
+import os, signal, subprocess, sys, time
+limit, parent, *words = sys.argv[1:]
+signal.pthread_sigmask(signal.SIG_SETMASK, [])
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, range(os.cpu_count()))
+try:
+    program = subprocess.Popen(words, start_new_session=True)
+except OSError as error:
+    sys.exit(f"cannot be started: {error.strerror}")
+end = time.monotonic() + float(limit)
+while program.poll() is None and os.getppid() == int(parent) and time.monotonic() < end:
+    time.sleep(0.01)
+code = program.poll()
+try:
+    os.killpg(program.pid, signal.SIGKILL)
+except ProcessLookupError:
+    pass
+sys.exit(124 if code is None else code)
+"""
+
+
 def _call(walker: Walker, request: Path, log: Path) -> None:
     """Run the program, and end it with all that it started when its time is over."""
-    words = [str(walker.path), str(request), str(log.resolve())]
-    if walker.path.suffix == ".py" and not os.access(walker.path, os.X_OK):
+    path = walker.path
+    words = [str(path), str(request), str(log.resolve())]
+    if path.suffix == ".py" and not (os.access(path, os.X_OK) and path.read_bytes()[:2] == b"#!"):
         words.insert(0, sys.executable)
-    printed = request.with_name("printed")
-    with printed.open("wb") as out:
-        try:
-            process = subprocess.Popen(
-                words,
-                cwd=walker.path.parent,
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
-        except OSError as error:  # no interpreter, or another machine's program
-            raise InputError(f"{walker.path}: cannot be started: {error.strerror}") from None
-        try:
-            code = process.wait(walker.limit)
-        except subprocess.TimeoutExpired:
-            raise InputError(
-                f"{walker.path}: took longer than {walker.limit:g} s; killed"
-            ) from None
-        finally:
-            if process.poll() is None:
-                os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
-    if code:
-        lines = printed.read_text(errors="replace").split("\n")
-        last = next((one_line(line) for line in reversed(lines) if line.strip()), "no output")
-        raise InputError(f"{walker.path}: ended with code {code}: {last}")
+    inputs = [sys.executable, "-I", "-S", "-c", _SUPERVISOR, str(walker.limit), str(os.getpid())]
+    ran = subprocess.run(
+        [*inputs, *words],
+        cwd=path.parent,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,
+        check=False,
+    )
+    if ran.returncode == 124:
+        raise InputError(f"{path}: took longer than {walker.limit:g} s; killed")
+    if ran.returncode:
+        lines = [x for x in ran.stdout.decode(errors="replace").split("\n") if x.strip()]
+        last = one_line(lines[-1]) if lines else "no output"
+        raise InputError(f"{path}: ended with code {ran.returncode}: {last}")

@@ -246,8 +246,9 @@ def named_loss(weights: Mapping[str, Any]) -> Loss:
     >>> [term.name for term in named_loss({"L_pos": 0.0, "L_vel": 1e5})]
     ['L_Eul', 'L_pos', 'L_ctrl', 'L_vel']
     """
-    added = tuple(term for term in OPTIONAL_TERMS if term.name in weights)
-    return with_alphas(weights, PAPER_LOSS + added)
+    loss = with_alphas(weights, PAPER_LOSS + OPTIONAL_TERMS)
+    absent = {term.name for term in OPTIONAL_TERMS} - {*weights}
+    return tuple(term for term in loss if term.name not in absent)
 
 
 def loss_of_robot(description: Description) -> Loss:

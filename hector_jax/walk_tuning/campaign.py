@@ -19,6 +19,7 @@ from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights, direction_names
 from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import choose
 from hector_jax.robot.model import Robot
 from hector_jax.search.cmaes import checked_bounds
 from hector_jax.search.few_walks import Space
@@ -44,6 +45,7 @@ class Campaign:
     model: str = "grounded"
 
     def __post_init__(self) -> None:
+        choose("Campaign.model", self.model, ("grounded", "plain", "none"))
         start = jax.tree.map(np.asarray, init(self.config, self.start).start)
         start = with_leg_numbers(self.config.rollout.walk, start, self.leg_numbers)
         object.__setattr__(self, "start", start)
