@@ -3,14 +3,7 @@
 import numpy as np
 import pytest
 
-from hector_jax.search.few_walks import (
-    Model,
-    WalkResult,
-    incumbent,
-    needs_model,
-    propose,
-    space_of,
-)
+from hector_jax.search.few_walks import Model, WalkResult, incumbent, needs_model, propose, space_of
 
 SIZE = 5
 MATRIX = np.diag([4.0, 1.0, 0.25, 0.0])  # of four of the five steps

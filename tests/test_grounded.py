@@ -9,10 +9,7 @@ from hector_jax.control.weights import nominal, vector_to_weights, weights_to_ve
 from hector_jax.core.trajectory import State, Wrench, no_samples
 from hector_jax.tuning.curvature import gauss_newton_jit
 from hector_jax.tuning.evaluate import evaluate_jit
-from hector_jax.tuning.grounded import (
-    fit_grounding,
-    grounded_rollout,
-)
+from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
 from hector_jax.tuning.loss import PAPER_LOSS
 from hector_jax.tuning.rollout import Scenario
 
