@@ -9,8 +9,6 @@ SIZE = 5
 MATRIX = np.diag([4.0, 1.0, 0.25, 0.0])  # of four of the five steps
 SPACE = space_of(MATRIX, np.tile([-3.0, 3.0], (SIZE, 1)))
 GOAL = np.array([0.8, -0.6, 0.5, 0.4, -0.7])  # in steps
-
-
 SCALE = np.append(np.diag(MATRIX), 1.0) + 0.3
 
 

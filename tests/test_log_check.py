@@ -107,6 +107,7 @@ FAULTS = {
     "feet in the air are commanded 20 N": in_air,
     "the torque of left_knee is at its limit": weak_motor,
     "its own reference, which follows it": drifting,
+    "expected are those of the ground on the robot": scaled(-1.0, "command.force"),
     "the sign of left_hip_pitch and its likes": of_legs(lambda q: q * [1, 1, -1, 1, 1]),
     "left and right legs are exchanged": of_legs(lambda q: q[:, ::-1]),
     "feet that stand are 2.. cm above the floor": high,
@@ -143,7 +144,10 @@ def test_of_two_faults_each_is_named(tmp_path, sound):
 def test_what_tells_nothing_is_refused(tmp_path, sound):
     for change, told in (
         ({"torque": np.zeros((7, 3))}, r"torque must be numbers of shape \(2000, 10\), got float"),
-        ({"state.euler": np.degrees(sound["state.euler"])}, "roll or pitch reaches .* in degrees"),
+        (
+            {"state.euler": np.degrees(sound["state.euler"])},
+            "roll or pitch reaches .* expected radians",
+        ),
     ):
         with pytest.raises(InputError, match=told):
             found(tmp_path, sound | change)

@@ -113,7 +113,7 @@ def test_control_counts_each_change_once_and_those_at_changes_of_stance_are_its_
     contact[4:, 0] = False
     trajectory = trajectory._replace(command=Wrench(force, moment), contact=contact)
     assert switches_of(trajectory) == pytest.approx(60.0**2)
-    assert float(between_loss(trajectory)) == pytest.approx(25.0 + 16.0 + 4.0)
+    assert float(jax.jit(between_loss)(trajectory)) == pytest.approx(25.0 + 16.0 + 4.0)
     assert parts_of(trajectory)["L_ctrl"] == pytest.approx(60.0**2 + 45.0)
 
 

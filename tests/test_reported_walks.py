@@ -32,8 +32,6 @@ SECONDS = 0.1
 SPEEDS = {"ahead": (0.5, 0.0), "aside": (0.0, 0.5), "back": (-0.5, 0.0)}
 TOML = 'name = "{}"\n[[segment]]\nseconds = 0.1\nv_x = {}\nv_y = {}\n'
 POINTS = 0.1 * np.random.default_rng(0).standard_normal((9, 19))
-
-
 ROBOT = jax.tree.map(np.asarray, load_robot())
 
 

@@ -86,7 +86,7 @@ def test_a_log_with_the_least_entries_is_a_walk_and_its_yaw_goes_on(tmp_path, ar
 
 def test_how_a_walk_ended_is_told(tmp_path, arrays):
     _, end = read(tmp_path, arrays, seconds=0.14)
-    assert end == "its log ends after 0.10 of 0.14 s, which counts as a fall"
+    assert end == "its log has 20 of 28 samples of 0.005 s, which counts as a fall"
     for row, value, told in ((8, 0.1, "fell after 0.04 s"), (8, np.nan, "no number from 0.04 s")):
         changed = arrays["state.position"].copy()
         changed[row:, 2] = value
@@ -103,7 +103,10 @@ def test_how_a_walk_ended_is_told(tmp_path, arrays):
         ({"state.euler": np.full((20, 3), np.nan)}, "state.euler must hold finite numbers"),
         ({"joints": np.full((20, 10), np.nan)}, "joints must hold finite numbers"),
         ({"command.force": None}, "command.force is missing; expected initial.euler"),
-        ({"joints": np.zeros((21, 10))}, "expected 20 samples of joints, got 21"),
+        (
+            {"joints": np.zeros((21, 10))},
+            "expected 20 samples of joints in 0.1 s of 0.005 s, got 21",
+        ),
         ({"contact": np.full((20, 2), 0.5)}, "contact must hold zeros and ones"),
         ({"period": np.array(0.003)}, r"period must be 0.01 s, the gait's tick, divided by a who"),
     ],
@@ -138,7 +141,10 @@ def test_a_program_walks_with_the_weights_and_the_command_that_it_is_asked_for(t
         ("raise SystemExit('no solver')", "ended with code 1: no solver"),
         ("import time; time.sleep(60)", "took longer than 2 s; killed"),
         ("", "ended with code 0, but wrote no log"),
-        ("log.pop('joints')\n" + WRITE, "its log: expected 20 samples of joints, got 0"),
+        (
+            "log.pop('joints')\n" + WRITE,
+            "its log: expected 20 samples of joints in 0.1 s of 0.005 s, got 0",
+        ),
     ],
 )
 def test_a_program_that_makes_no_walk_is_told_in_one_line(tmp_path, text, told):

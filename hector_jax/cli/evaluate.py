@@ -33,6 +33,7 @@ from hector_jax.robot.model import load_robot
 from hector_jax.sim.diagnosis import Fall, fall_of
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
+from hector_jax.sim.walker import walker_of, write_log
 from hector_jax.store import nets, tunings
 from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
@@ -81,7 +82,8 @@ def run_evaluate(args: Evaluate) -> None:
         write_json(args.out, result)
     names = arguments.short_names(args.weights)
     scores = {names[text]: score for text, score in verdict.scores.items()}
-    print_text = partial(print_table, verdict._replace(scores=scores), title, args.world)
+    world = engine.title if args.walker else args.world
+    print_text = partial(print_table, verdict._replace(scores=scores), title, world)
     print_result(args.json, result, print_text)
 
 
@@ -114,7 +116,10 @@ def run_walk(args: Walk) -> None:
     fell = bool(score.fallen) and not unsolved  # without a plan, it is not due to the weights
     if fell and args.world != "srbm" and not engine.differs:
         fall = fall_of(config, robot, arguments.job_of(args, robot, command, weights, plant))
-    if args.out is not None:
+    if args.out is not None and args.walker:  # as the program writes it, with all its entries
+        job = arguments.job_of(args, robot, command, weights, plant)
+        write_log(walker_of(args.walker, args.walker_limit), job, args.out)
+    elif args.out is not None:
         seconds = arguments.walk_seconds(args, command)
         about = as_table(args) | {"walk": walk_card(*command[:2], weights, robot, seconds)}
         save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=about)

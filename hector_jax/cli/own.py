@@ -8,14 +8,13 @@ from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import Check, Tune
 from hector_jax.control.controller import walk_config
-from hector_jax.control.parameters import leg_numbers, model_numbers
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.console import say
 from hector_jax.core.environment import environment
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
-from hector_jax.report.report import print_table
+from hector_jax.report.report import first_lines, print_table
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.log_check import check_log, read_check
 from hector_jax.sim.loop import Job
@@ -48,8 +47,7 @@ def tune_own(folder: Path, args: Tune) -> None:
     """
     robot, made_with = load_robot(args.robot), environment()
     trajectories = run_folder.trajectories(args, robot)
-    config = tunings.tune_config(robot, others=model_numbers(args.tune))
-    config = arguments.with_length(config, trajectories[0])
+    config = arguments.with_length(tunings.tune_config(robot), trajectories[0])
     seconds = config.rollout.ticks * config.rollout.walk.gait.tick
     campaign = Campaign(
         folder / "walks",
@@ -58,7 +56,6 @@ def tune_own(folder: Path, args: Tune) -> None:
         arguments.weights_by_name(args.start, robot),
         {trajectory.name: trajectory.command for trajectory in trajectories},
         choice.drawn_plants(robot, args.walk_plants) or [hfs(robot.description)],
-        leg_numbers=leg_numbers(args.tune),
         engine=arguments.engine_of(args),
     )
     _check_first(args, campaign, seconds)
@@ -88,6 +85,7 @@ def tune_own(folder: Path, args: Tune) -> None:
     write_json(folder / RESULT, result)
 
     def print_text() -> None:
+        print(*first_lines(whole, str(folder))[:2], "", sep="\n")  # how far off, and falls
         for name, of in ({", ".join(by_name): whole} | by_name).items():
             print_table(of, f"{name}, {plural(len(seeds), 'plant')}", campaign.engine.title)
 

@@ -139,7 +139,12 @@ def resume(folder: Path, args: Tune) -> Tune:
     check_agreement(folder, config, {"robot": robot_hash(load_robot(begun.robot))})
     flags = merge_flags(folder, begun, args, call_flags=_CALL_FLAGS)
     data = arguments.data_folder(flags.data, flags.robot, load_robot(flags.robot))
-    if not flags.net and not data.exists() and Path(config["directory"]) != Path.cwd():
+    if (
+        not flags.walker
+        and not flags.net
+        and not data.exists()
+        and Path(config["directory"]) != Path.cwd()
+    ):
         raise InputError(
             f"{data}: no data here; the run was begun in {config['directory']}: resume it there, "
             "or name the folder by --data"

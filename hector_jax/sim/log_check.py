@@ -25,7 +25,7 @@ from hector_jax.sim.walk_file import read_walk, reference_of
 SETTLED, SHORTEST = 0.5, 1.0  # [s] after t = 0; of a walk from then on
 LOADED = 0.2  # share of the weight on a foot that stands
 ASTRAY = 0.25  # share of samples whose planned contact is not that of the commanded load
-MASS = 0.05  # share of the weight
+MASS, COMMANDED_MASS = 0.05, 0.15  # share of the weight, by the ground and by the commands
 LONGEST, LATE = 0.06, 0.015  # [s] delays of the ground's force that are tried; largest usual one
 GAIN = 0.15  # of the ground's force by the commanded one, from 1
 IN_AIR = 0.02  # share of the weight
@@ -89,6 +89,11 @@ def check_log(log: CheckedLog, tick: float) -> list[str]:
         log: of `read_check`.
         tick: interval of this project's plans [s].
     """
+    if (force := log.walk.command.force[..., 2].sum(axis=1).mean()) < 0.0:
+        return [
+            f"the commanded forces are {force:.0f} N upwards in the mean: expected are those of "
+            "the ground on the robot, not those of the robot on the ground"
+        ]
     questions = _contacts, _velocities, _legs, _loads, _ground, _air, _torques, _reference, _plans
     return [line for ask in questions for line in ask(log, tick)]
 
@@ -141,7 +146,8 @@ def _velocities(log: CheckedLog, tick: float) -> Iterator[str]:
         if (as_is := error(found)) <= UNLIKE:
             continue
         guesses = {"it is in the frame of the trunk": error(turned)}
-        guesses["it is in degrees"] = error(np.radians(found))
+        unit, scale = ("mm/s", 1e-3) if name == "velocity" else ("degrees", np.pi / 180.0)
+        guesses[f"it is in {unit}"] = error(scale * found)
         guesses["its sign is the other one"] = error(-found)
         guess = min(guesses, key=lambda words: guesses[words])
         cause = f": {guess}" if guesses[guess] < BETTER * as_is else ""
@@ -160,8 +166,8 @@ def _sliding(log: CheckedLog, joints: Float[np.ndarray, "n joints"]) -> tuple[fl
     standing = np.asarray(windows.all(axis=-1))
     speed = np.linalg.norm(_slope(feet, period), axis=-1)
     inner = speed[span // 2 :][: len(standing)][standing]
-    heights = feet[log.stance, 2]
-    return float(np.sqrt(np.mean(inner**2))) if len(inner) else 0.0, float(np.mean(heights))
+    height = float(feet[log.stance, 2].mean()) if log.stance.any() else 0.0
+    return float(np.sqrt(np.mean(inner**2))) if len(inner) else 0.0, height
 
 
 def _legs(log: CheckedLog, tick: float) -> Iterator[str]:
@@ -204,7 +210,7 @@ def _loads(log: CheckedLog, tick: float) -> Iterator[str]:
     """Is the mass that of the file, and does the robot stand at its height?"""
     force = (log.walk.effect if log.has_effect else log.walk.command).force[..., 2].sum(axis=1)
     share = float(np.mean(force)) / log.weight
-    if abs(share - 1.0) > MASS:
+    if abs(share - 1.0) > (MASS if log.has_effect else COMMANDED_MASS):
         bears = "the ground bears" if log.has_effect else "commanded are"
         yield (
             f"{bears} {share * log.weight:.0f} N in the mean, the robot's file weighs "
@@ -262,7 +268,7 @@ def _reference(log: CheckedLog, tick: float) -> Iterator[str]:
     if away > STEADY and to_own < FOLLOWS * away:
         yield (
             f"the robot is {100 * away:.0f} cm off the commanded path, {100 * to_own:.0f} cm off "
-            "its own reference, which follows it: set L_pos = 0 and L_vel, L_yaw_rate in [loss]"
+            "its own reference, which follows it: weights change that by the speed alone"
         )
 
 

@@ -48,6 +48,7 @@ def read_walk(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Tr
     except Exception as error:  # a foreign archive can fail in any way
         raise InputError(f"{path}: not a log (.npz): {one_line(error)}") from None
     empty = no_samples(len(robot.joint_lower), len(robot.foot_point))
+    asked = "" if "period" in arrays else "; is period missing?"
     arrays = {"period": np.array(TIME_STEP)} | arrays
     if not _divides(period := arrays["period"], tick):
         text = f"must be {tick} s, the gait's tick, divided by a whole number"
@@ -56,26 +57,31 @@ def read_walk(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Tr
     wanted = round(seconds / period)
     count = next(iter(arrays.get("joints", np.zeros(())).shape), 0)
     if not 1 <= count <= wanted:
-        raise InputError(f"{path}: expected {wanted} samples of joints, got {count}")
+        expected = f"{wanted} samples of joints in {seconds:g} s of {period:g} s"
+        raise InputError(f"{path}: expected {expected}, got {count}{asked}")
     walk = _checked(path, arrays, empty, count)
     finite = np.all([np.isfinite(x).all(axis=1) for x in walk.state], axis=0)
     valid = count if finite.all() else int(np.argmin(finite))
     for name, x in named_leaves(walk).items():
         if not np.isfinite(x[: max(valid, 1)] if np.ndim(x) and len(x) == count else x).all():
             raise InputError(f"{path}: {name} must hold finite numbers")
-    upright = walk.state.position[:valid, 2] >= robot.description.limits[0]
-    if (angle := np.abs(walk.state.euler[:valid, :2][upright]).max(initial=0.0)) > np.pi:
-        raise InputError(f"{path}: roll or pitch reaches {angle:.3g} at full height: in degrees?")
+    min_height, max_tilt = robot.description.limits
+    tilt = np.abs(walk.state.euler[:valid, :2]).max(axis=1)
+    tilt = np.where(walk.state.position[:valid, 2] >= min_height, tilt, 0.0)  # of an upright trunk
+    if tilt.max(initial=0.0) > np.pi or (tilt[:1] > max_tilt).any():
+        text = f"roll or pitch reaches {tilt.max():.3g} at full height"
+        raise InputError(f"{path}: {text}, expected radians")
     rows = np.minimum(np.arange(wanted), valid - 1)
     samples = jax.tree.map(lambda x: x[rows], walk._replace(period=None, initial=None))
-    down = np.asarray(has_fallen(samples.state, *robot.description.limits))
+    down = np.asarray(has_fallen(samples.state, min_height, max_tilt))
     fallen = np.maximum.accumulate(down | samples.fallen) | (np.arange(wanted) >= valid)
     stood = int(np.argmax(fallen)) if fallen.any() else wanted
     end = "" if stood == wanted else f"fell after {period * stood:.2f} s"
     if end and stood == valid < count:
         end = f"its state is no number from {period * stood:.2f} s on, which counts as a fall"
     elif end and stood == count:
-        end = f"its log ends after {period * stood:.2f} of {seconds:g} s, which counts as a fall"
+        end = f"its log has {count} of {wanted} samples of {period:g} s"
+        end = f"{end}, which counts as a fall{asked}"
     yaw = np.unwrap(np.append(walk.initial.euler[2], samples.state.euler[:, 2]))[1:]
     euler = np.column_stack([samples.state.euler[:, :2], yaw])
     state = samples.state._replace(euler=euler)
