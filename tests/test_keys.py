@@ -63,8 +63,8 @@ def collected(k=0, robot=ROBOT, engine="c"):
 
 DEPENDS_ON = {
     "mass": lambda k: ROBOT._replace(mass=np.asarray(12.0 + k)),
-    "TOML of the robot": lambda k: robot_with(estimate_noise=k),
-    "noise of a tuning": lambda k: tune_config(robot_with(estimate_noise=k)),
+    "TOML of the robot": lambda k: robot_with(estimate_noise=float(k)),
+    "noise of a tuning": lambda k: tune_config(robot_with(estimate_noise=float(k))),
     "delay of a tuning": lambda k: tune_config(robot_with(delay=0.005 * k)),
     "rule": lambda k: replace(CONFIG, rule=("relative", "literal")[k]),
     "loss": loss_with,
@@ -76,7 +76,7 @@ DEPENDS_ON = {
     "seed of a walk": lambda k: JOB._replace(seed=k),
     "engine": lambda k: MUJOCO_C._replace(walk=lambda *inputs, **options: k).key,
     "seed of a collection": collected,
-    "robot of a collection": lambda k: collected(robot=robot_with(estimate_noise=k)),
+    "robot of a collection": lambda k: collected(robot=robot_with(estimate_noise=float(k))),
     "engine of a collection": lambda k: collected(engine=("c", "mjx")[k]),
 }
 

@@ -124,7 +124,7 @@ def test_yaw_goes_on_past_half_a_turn():
     row, before = np.zeros(43), jnp.zeros(())
     for yaw in np.linspace(0.0, 9.0, 40):
         row[3:7] = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
-        before = yaw_of(sensing.unpack_reading(row), before)
+        before = yaw_of(sensing.unpack_reading(jnp.asarray(row)), before)
         assert before == pytest.approx(yaw, abs=1e-9)
 
 
