@@ -1,11 +1,13 @@
-"""Walks, scores and verdicts that no simulator made, for what is only drawn, judged or written."""
+"""A console in this process; walks and scores that no simulator made, for what is only drawn."""
 
+import sys
 from unittest import mock
 
 import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hector_jax.cli.main import main
 from hector_jax.control.weights import nominal
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.core.tree import stack
@@ -24,6 +26,12 @@ def instead(patch, module, name, fake):
     made = mock.create_autospec(getattr(present, "real", present), side_effect=fake)
     made.real = getattr(present, "real", present)  # which has the signature, should it come again
     patch.setattr(module, name, made)
+
+
+def call(monkeypatch, *words):
+    """Run a line of the console script in this process; its exit code."""
+    monkeypatch.setattr(sys, "argv", ["hector", *map(str, words)])
+    return main()
 
 
 def pretend_walk(seed=0, error=0.03, seconds=4.0, period=0.01, fall_at=None, turn=0.0):

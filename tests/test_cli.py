@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from model import BEST_OTHERS
-from pretend import instead
+from pretend import call, instead
 from synthetic import synthetic_walk
 
 from hector_jax.cli import arguments, doctor
 from hector_jax.cli.flags import COMMANDS, Tune
-from hector_jax.cli.main import main
 from hector_jax.cli.parse import from_file
 from hector_jax.control.parameters import GROUPS
 from hector_jax.control.weights import weight_names, weights_to_vector
@@ -25,11 +24,6 @@ from hector_jax.store import nets, tunings
 from hector_jax.store.nets import CollectConfig
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
-
-
-def call(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["hector", *map(str, arguments)])
-    return main()
 
 
 def refused(monkeypatch, capsys, *arguments):

@@ -2,14 +2,12 @@
 
 import json
 import re
-import sys
 
 import jax
 import numpy as np
 import pytest
-from pretend import instead, pretend_walk
+from pretend import call, instead, pretend_walk
 
-from hector_jax.cli.main import main
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import nominal
@@ -129,24 +127,21 @@ def weak(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_start_that_falls_is_refused_before_anything_is_collected(monkeypatch, weak, capsys):
     flags = ["--start", "weak.json", "--seeds", "1", "--no-video", "--processes", "1"]
-    monkeypatch.setattr(sys, "argv", ["hector", "tune", "--traj", "straight", *flags])
-    assert main() == 2
+    assert call(monkeypatch, "tune", "--traj", "straight", *flags) == 2
     line = "--start weak.json cannot be tuned from: straight on the high-fidelity simulator fell at"
     assert line in capsys.readouterr().err
     assert not list(weak.glob("data/**/*.npz"))
 
 
 def test_hector_walk_tells_the_fall_and_prints_no_nan(monkeypatch, weak, capsys):
-    words = ["hector", "walk", "--weights", "weak.json", "--seconds", "0.1"]
-    monkeypatch.setattr(sys, "argv", words)
-    assert main() == 0
+    words = ["walk", "--weights", "weak.json", "--seconds", "0.1"]
+    assert call(monkeypatch, *words) == 0
     out = capsys.readouterr().out
     assert re.search(
         r": fell at -\d.\d+ s, in the start-up: centre of mass .*likeliest cause: ", out
     )
     assert "nan" not in out
-    monkeypatch.setattr(sys, "argv", [*words, "--json"])
-    assert main() == 0
+    assert call(monkeypatch, *words, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert told["fell"]
     assert told["seconds"] == told["fall"]["time"] < 0.0

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 
 import jax
 import pytest
+from pretend import call
 
-from hector_jax.cli.main import main
 from hector_jax.control.reference import standing_anchor
 from hector_jax.core.inputs import InputError
 from hector_jax.grfm.effect import last_command
@@ -57,10 +57,8 @@ def test_a_walk_and_an_evaluation_take_an_engine_that_was_added(monkeypatch, cap
     monkeypatch.setitem(ENGINES, "mjx", Engine("mjx", "rigid body", walk_rigid, lambda exact: 64))
     flags = ["--engine", "mjx", "--seconds", "0.5", "--json"]
     for words in (["walk", "--world", "ideal"], ["evaluate", "--world", "hfs"]):
-        monkeypatch.setattr(sys, "argv", ["hector", *words, "--weights", "nominal", *flags])
-        assert main() == 0
+        assert call(monkeypatch, *words, "--weights", "nominal", *flags) == 0
         assert json.loads(capsys.readouterr().out)["engine"] == "mjx"
     for flag, value in (("--engine", "mjx"), ("--plant", str(ARMS))):
-        monkeypatch.setattr(sys, "argv", ["hector", "walk", "--world", "srbm", flag, value])
-        assert main() == 2
+        assert call(monkeypatch, "walk", "--world", "srbm", flag, value) == 2
         assert re.search(f"{flag}.* needs a world", capsys.readouterr().err)

@@ -1,7 +1,6 @@
 """A robot with four legs as data: what is found, proposed, read, and what is refused."""
 
 import re
-import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -11,8 +10,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from pretend import call
 
-from hector_jax.cli.main import main
 from hector_jax.control.controller import walk_config
 from hector_jax.control.legs import stance_torques
 from hector_jax.core.inputs import InputError
@@ -84,8 +83,7 @@ def test_hind_knees_that_bend_the_other_way_are_told_and_stand(tmp_path, monkeyp
     for joint in ("pitch", "knee"):
         front, hind = (angles[f"{pair}_left_{joint}"] for pair in ("front", "hind"))
         assert hind == pytest.approx(-front, abs=1e-3)
-    monkeypatch.setattr(sys, "argv", ["hector", "robot", str(path)])
-    assert main() == 0
+    assert call(monkeypatch, "robot", path) == 0
     assert "knees bend backwards in front and forwards behind" in capsys.readouterr().out
 
 

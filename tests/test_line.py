@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+from pretend import call
 
 from hector_jax.cli import commands
 from hector_jax.cli.arguments import flag_folder
 from hector_jax.cli.flags import COMMANDS, Compare, Evaluate, Export, Tune, View, Walk
-from hector_jax.cli.main import main
 from hector_jax.cli.parse import from_line, resolve_latest
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.model import load_robot
@@ -20,8 +20,7 @@ from hector_jax.robot.model import load_robot
 
 def refused(monkeypatch, capsys, *words):
     """The one line that a command is refused with."""
-    monkeypatch.setattr(sys, "argv", ["hector", *map(str, words)])
-    assert main() == 2
+    assert call(monkeypatch, *words) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert err.count("\n") == 1, err

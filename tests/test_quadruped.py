@@ -1,7 +1,6 @@
 """Four point feet: gaits, weights without moments, the net's views, walks."""
 
 import json
-import sys
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -11,9 +10,9 @@ import jax.numpy as jnp
 import jsonschema
 import numpy as np
 import pytest
+from pretend import call
 
 from hector_jax.cli.arguments import with_gait
-from hector_jax.cli.main import main
 from hector_jax.control import gait
 from hector_jax.control.controller import plan_horizon, walk_config
 from hector_jax.control.footstep import Feet
@@ -78,14 +77,12 @@ def test_a_gait_that_cannot_be_is_refused():
 def test_a_gait_is_chosen_by_name(monkeypatch, capsys):
     assert walk_config(with_gait(ROBOT, "own")).gait == CONFIG.gait
     assert walk_config(with_gait(ROBOT, "crawl")).gait == gait_named(CONFIG.gait, "crawl")
-    words = f"hector walk --robot {FILE} --world srbm --seconds 0.3 --json --gait stand"
-    monkeypatch.setattr(sys, "argv", words.split())
-    assert main() == 0
+    words = f"walk --robot {FILE} --world srbm --seconds 0.3 --json --gait stand"
+    assert call(monkeypatch, *words.split()) == 0
     out, told = capsys.readouterr()
     assert "straight is not walked: all feet stand" in told
     assert json.loads(out)["L"] < 1.0
-    monkeypatch.setattr(sys, "argv", ["hector", "walk", "--gait", "trot"])
-    assert main() == 2
+    assert call(monkeypatch, "walk", "--gait", "trot") == 2
     assert "--gait: unknown gait 'trot'" in capsys.readouterr().err
 
 

@@ -1,15 +1,13 @@
 """Weight sets in several engines and models: the counts, what is claimed of them, the command."""
 
 import json
-import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pretend import instead, pretend_score, pretend_walk
+from pretend import call, instead, pretend_score, pretend_walk
 
 from hector_jax.cli import verdict as command
-from hector_jax.cli.main import main
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.inputs import InputError
@@ -145,11 +143,6 @@ def walked(monkeypatch):
     instead(monkeypatch, judging, "walk_jobs", walks_of)
     instead(monkeypatch, command, "choose_engine", choose)
     return state
-
-
-def call(monkeypatch, *words):
-    monkeypatch.setattr(sys, "argv", ["hector", *map(str, words)])
-    return main()
 
 
 def test_all_engines_and_models_walk_and_a_cut_verdict_goes_on(

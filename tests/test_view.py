@@ -8,11 +8,10 @@ import time
 import numpy as np
 import pytest
 from browser import CHROMIUM, opened
-from pretend import elsewhere, instead, pretend_history, pretend_walk
+from pretend import call, elsewhere, instead, pretend_history, pretend_walk
 
 from hector_jax.cli import arguments
 from hector_jax.cli.flags import Tune
-from hector_jax.cli.main import main
 from hector_jax.cli.parse import as_table
 from hector_jax.control.weights import expert, nominal, weights_to_vector
 from hector_jax.control.weights_file import save_weights
@@ -107,9 +106,8 @@ def test_metrics_of_a_run_that_goes_on_are_read_and_its_newest_weights_taken(tmp
 
 
 def test_what_is_no_run_is_refused_in_one_line(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(sys, "argv", ["hector", "view", str(tmp_path), "--headless"])
     for fault in (": cannot read a file of a run of", ": expected a JSON object"):
-        assert main() == 2
+        assert call(monkeypatch, "view", tmp_path, "--headless") == 2
         out, err = capsys.readouterr()
         assert out == ""
         assert err.splitlines()[-1].startswith(f"hector: {tmp_path}/config.json{fault}")
@@ -124,8 +122,7 @@ def test_headless_writes_film_and_pictures_instead(monkeypatch, capsys, tmp_path
     monkeypatch.setattr(inputs, "find_spec", lambda name: None)  # needs no viser
     run, out = pretend_run(tmp_path / "run"), tmp_path / "out"
     flags = ["--world", "srbm", "--sets", "nominal", "expert"]
-    monkeypatch.setattr(sys, "argv", ["hector", "view", *map(str, [run, "--out", out, *flags])])
-    assert main() == 0
+    assert call(monkeypatch, "view", run, "--out", out, *flags) == 0
     assert "no net at" in capsys.readouterr().err
     assert [path.name for path, *_ in filmed] == ["film.mp4", "film.png"]
     assert list(filmed[0][2]) == ["before: nominal", "after: expert"]
