@@ -153,7 +153,7 @@ def test_what_tells_nothing_is_refused(tmp_path, sound):
             found(tmp_path, sound | change)
     fallen = sound["state.position"].copy()
     fallen[1300:, 2] = 0.0
-    with pytest.raises(InputError, match="ends after 1.30 s, too early to tell anything"):
+    with pytest.raises(InputError, match="fell after 1.30 s: too early to tell anything"):
         found(tmp_path, sound | {"state.position": fallen})
 
 

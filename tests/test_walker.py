@@ -1,15 +1,20 @@
 """A program of the user that walks: its log, its ends, and what takes it as an engine."""
 
 import json
+import os
+import signal
 import sys
+import time
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 from model import AHEAD, ROBOT
+from pretend import call
 
-from hector_jax.cli.main import main
 from hector_jax.control.controller import walk_config
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.inputs import InputError
@@ -155,7 +160,9 @@ def test_a_program_that_makes_no_walk_is_told_in_one_line(tmp_path, text, told):
 
 
 def test_in_a_tuning_a_walk_that_is_not_made_is_a_fall(tmp_path, capsys):
-    walker = walker_of(program(tmp_path, "raise SystemExit('no solver')"), 20.0, strict=False)
+    walker = walker_of(program(tmp_path, "raise SystemExit('no solver')"), 20.0)._replace(
+        strict=False
+    )
     job = Job(nominal(ROBOT), AHEAD, hfs(ROBOT.description), SECONDS)
     walk = next(walker_engine(walker).walk(None, CONFIG, ROBOT, [job]))
     assert walk.fallen.all()
@@ -168,11 +175,31 @@ def test_a_program_that_hangs_is_ended_with_what_it_started(tmp_path):
     text += "open('pid', 'w').write(str(a.pid))\ntime.sleep(60)\n"
     with pytest.raises(InputError, match="took longer"):
         walked(program(tmp_path, text), limit=3.0)
-    stat = f"/proc/{(tmp_path / 'pid').read_text()}/stat"
-    try:
-        assert " Z " in open(stat).read()  # dead, and waits for whoever asks
-    except FileNotFoundError:
-        pass
+    assert ended(tmp_path)
+
+
+def ended(folder, patience=20.0):
+    """Whether the process that a program noted comes to its end."""
+    stat, until = Path("/proc", (folder / "pid").read_text(), "stat"), time.monotonic() + patience
+    while stat.exists() and " Z " not in stat.read_text():
+        if time.monotonic() > until:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+def test_a_program_ends_when_whoever_waits_for_it_is_killed(tmp_path):
+    path = program(
+        tmp_path, "import os, time\nopen('pid', 'w').write(str(os.getpid()))\ntime.sleep(60)"
+    )
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        walk = pool.submit(walked, path)
+        while not (tmp_path / "pid").exists() or not (tmp_path / "pid").read_text():
+            time.sleep(0.02)
+        (waiting,) = pool._processes
+        os.kill(waiting, signal.SIGKILL)
+        assert isinstance(walk.exception(), BrokenExecutor)
+    assert ended(tmp_path)
 
 
 def test_what_cannot_be_a_walker_is_refused(tmp_path):
@@ -180,7 +207,7 @@ def test_what_cannot_be_a_walker_is_refused(tmp_path):
     for name, told in (("gone.py", "no such file"), ("no.sh", r"chmod \+x")):
         with pytest.raises(InputError, match=told):
             walker_of(tmp_path / name, 1.0)
-    with pytest.raises(InputError, match="has a robot of its own: --plant cannot be given"):
+    with pytest.raises(InputError, match="has a robot of its own: Job.plant must be None"):
         walked(program(tmp_path), plant=ROBOT)
 
 
@@ -202,19 +229,14 @@ def test_the_example_walks_by_a_controller_of_its_own():
     assert walk.effect.force[..., 2].sum(axis=1).mean() == pytest.approx(weight, rel=0.1)
 
 
-def run(monkeypatch, *words):
-    monkeypatch.setattr(sys, "argv", ["hector", *map(str, words)])
-    return main()
-
-
 def test_hector_evaluate_takes_it_as_an_engine(tmp_path, monkeypatch, capsys):
     path = program(tmp_path)
-    assert run(monkeypatch, "evaluate", "--walker", path, "--seeds", 2, "--json") == 0
+    assert call(monkeypatch, "evaluate", "--walker", path, "--seeds", 2, "--json") == 0
     found = json.loads(capsys.readouterr().out)
     assert found["engine"] == "mine.py"
     assert found["sets"]["nominal"]["standin"]["falls"] == 0
     line = ("evaluate", "--walker", path, "--engine", "c")
-    assert run(monkeypatch, *line) == 2
+    assert call(monkeypatch, *line) == 2
     assert "--engine and --walker: only one can be given" in capsys.readouterr().err
 
 
@@ -227,18 +249,18 @@ def test_hector_evaluate_takes_it_as_an_engine(tmp_path, monkeypatch, capsys):
 )
 def test_flags_that_do_not_go_with_a_walker_are_refused(tmp_path, monkeypatch, capsys, words, told):
     line = ("tune", "--walker", program(tmp_path), "--out", tmp_path / "run", *words)
-    assert run(monkeypatch, *line) == 2
+    assert call(monkeypatch, *line) == 2
     assert told in capsys.readouterr().err
 
 
 @pytest.mark.slow  # the model of a walk of 4 s is compiled
 def test_hector_tune_finds_what_its_walks_show(tmp_path, monkeypatch, capsys):
     line = ("tune", "--walker", program(tmp_path), "--out", tmp_path / "run", "--walks", 10)
-    assert run(monkeypatch, *line, "--walk-plants", 1, "--seeds", 2, "--json") == 0
+    assert call(monkeypatch, *line, "--walk-plants", 1, "--seeds", 2, "--json") == 0
     found = json.loads(capsys.readouterr().out)
     assert found["sets"]["best"]["standin"]["change"]["start"]["median"] < -1.0
     best = json.loads((tmp_path / "run" / "weights" / "best.json").read_text())
     assert abs(np.log(best["Q"]["position"][1] / 500.0)) < 0.7
     for words in (("view", tmp_path / "run", "--headless"), ("export", tmp_path / "run")):
-        assert run(monkeypatch, *words) == 2
+        assert call(monkeypatch, *words) == 2
         assert f"its walks are those of {tmp_path / 'mine.py'}" in capsys.readouterr().err

@@ -62,8 +62,12 @@ def engine_of(args: Evaluate | Tune | Verdict | Walk) -> Engine:
         if hasattr(args, name) and args.is_given(name):
             text = f"--{name.replace('_', '-')} is for this project's controller and simulators"
             raise InputError(f"{text}, so not beside --walker")
-    strict = not isinstance(args, Tune)  # a tuning goes on over night
-    return walker_engine(walker_of(args.walker, args.walker_limit, strict=strict))
+    walker = walker_of(args.walker, args.walker_limit)
+    if isinstance(args, Tune):  # it goes on over night
+        walker = walker._replace(strict=False)
+    elif isinstance(args, Walk):
+        walker = walker._replace(log=args.out)
+    return walker_engine(walker)
 
 
 def short_names(texts: Sequence[str]) -> dict[str, str]:

@@ -6,7 +6,7 @@ from functools import partial, singledispatch
 from pathlib import Path
 from typing import Any
 
-from hector_jax.cli import arguments, doctor, evaluate, flags, own, propose, tune, verdict, view
+from hector_jax.cli import arguments, doctor, evaluate, flags, propose, tune, verdict, view, walker
 from hector_jax.cli.arguments import print_result
 from hector_jax.control.controller import walk_config
 from hector_jax.control.weights import expert, nominal
@@ -49,7 +49,7 @@ for _command in (
     evaluate.run_evaluate,
     evaluate.run_walk,
     evaluate.run_grfm,
-    own.run_check,
+    walker.run_check,
     propose.run_propose,
     propose.run_report,
     tune.run_tune,

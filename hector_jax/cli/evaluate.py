@@ -1,5 +1,6 @@
 """Evaluate weight sets on walks, and nets on the ground forces of held-out walks."""
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,6 @@ from hector_jax.robot.model import load_robot
 from hector_jax.sim.diagnosis import Fall, fall_of
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
-from hector_jax.sim.walker import walker_of, write_log
 from hector_jax.store import nets, tunings
 from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
@@ -87,6 +87,17 @@ def run_evaluate(args: Evaluate) -> None:
     print_result(args.json, result, print_text)
 
 
+def _check_world(args: Walk) -> None:
+    """Raise an InputError if a flag needs a world with a plant and there is none."""
+    if args.world != "srbm":
+        return
+    if args.plant is not None:
+        raise InputError("--plant needs a world of MuJoCo, got --world srbm")
+    if args.engine != "c" or args.walker:
+        flag = "--walker" if args.walker else f"--engine {args.engine}"
+        raise InputError(f"{flag} needs a world with a plant, got --world srbm")
+
+
 def run_walk(args: Walk) -> None:
     """Walk once and report losses and errors.
 
@@ -97,11 +108,7 @@ def run_walk(args: Walk) -> None:
         check_film(args.video)
     robot = arguments.with_gait(load_robot(args.robot), args.gait)
     plant = arguments.plant_of(args.plant, robot)
-    if args.world == "srbm" and plant is not None:
-        raise InputError("--plant needs a world of MuJoCo, got --world srbm")
-    if args.world == "srbm" and (args.engine != "c" or args.walker):
-        flag = "--walker" if args.walker else f"--engine {args.engine}"
-        raise InputError(f"{flag} needs a world with a plant, got --world srbm")
+    _check_world(args)
     engine, weights = arguments.engine_of(args), arguments.weights_by_name(args.weights, robot)
     command = arguments.load_trajectory(args.traj, robot)
     loss, config = loss_of_robot(robot.description), walk_config(robot)
@@ -116,14 +123,11 @@ def run_walk(args: Walk) -> None:
     fell = bool(score.fallen) and not unsolved  # without a plan, it is not due to the weights
     if fell and args.world != "srbm" and not engine.differs:
         fall = fall_of(config, robot, arguments.job_of(args, robot, command, weights, plant))
-    if args.out is not None and args.walker:  # as the program writes it, with all its entries
-        job = arguments.job_of(args, robot, command, weights, plant)
-        write_log(walker_of(args.walker, args.walker_limit), job, args.out)
-    elif args.out is not None:
+    if args.out is not None and not args.walker:  # a program's own log is kept as it is
         seconds = arguments.walk_seconds(args, command)
         about = as_table(args) | {"walk": walk_card(*command[:2], weights, robot, seconds)}
         save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=about)
-    where = args.world + ("" if engine is MUJOCO_C else f" in engine {engine.name}")
+    where = args.world + ("" if engine is MUJOCO_C else f" in {engine.title}")
     where += "" if plant is None else f" on {plant.description.name}"
     title = f"{command.name} in {where}, {printable(args.weights)} weights"
     result: dict[str, Any] = {
@@ -147,7 +151,9 @@ def run_walk(args: Walk) -> None:
         name = Path(args.weights).stem
         baseline = "expert" if name == "nominal" else "nominal"
         say(f"walking with {baseline} weights for the other half of the film")
-        walks = {baseline: walk_with(arguments.weights_by_name(baseline, robot)), name: trajectory}
+        other = arguments.engine_of(replace(args, out=None))  # the log is that of the asked walk
+        before = walk_with(arguments.weights_by_name(baseline, robot), engine=other)
+        walks = {baseline: before, name: trajectory}
         pictures.film(args.video, robot, walks)
 
 

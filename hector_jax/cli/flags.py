@@ -243,7 +243,7 @@ class Search(Configured, ForRobot, Parallel, Printed):
     budget: Annotated[int, Range(1, 1_000_000)] = 200  # most walks per trajectory
     population: Annotated[int, Range(4, 10_000)] = 10  # walks in a generation
     seed: Seed = 0  # seed of the search
-    spread: Annotated[float, Range(0, 10, above=True)] = 1.0  # first deviation of log-weights
+    spread: Annotated[float, Range(0, 10, above=True)] = 1.0  # initial deviation of log-weights
     start: Weights = "nominal"  # nominal, expert, best or a weights file
     engine: Engine = "auto"  # c: MuJoCo, one walk per process; mjx: all at once; auto: mjx on a GPU
     out: Folder = Path("runs/search")  # folder for the best weights, each with a card

@@ -14,9 +14,9 @@ import numpy as np
 from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import BASELINES, Tune, Walk
-from hector_jax.cli.own import tune_own
 from hector_jax.cli.parse import as_command
 from hector_jax.cli.verdict import small_verdict
+from hector_jax.cli.walker import tune_walker
 from hector_jax.control.parameters import leg_numbers, model_numbers, step_names
 from hector_jax.control.reference import Command
 from hector_jax.control.trajectories import NamedCommand
@@ -55,7 +55,7 @@ def run_tune(args: Tune) -> None:
     """Tune one weight set for all trajectories, or one for each, in new or resumed runs."""
     if args.out and args.resume:
         raise InputError(f"--out {args.out} and --resume {args.resume}: only one can be given")
-    if args.video:
+    if args.video and not args.walker:
         check_film(Path("film.mp4"))
     base, robot = args.resume or args.out, load_robot(args.robot)
     runs = run_folder.by_folder(args, base, robot)
@@ -71,7 +71,7 @@ def run_tune(args: Tune) -> None:
     for folder, flags in runs.items():
         with locked(folder):
             say(f"the run folder is {folder}")
-            (tune_own if flags.walker else _tune_in)(folder, flags)
+            (tune_walker if flags.walker else _tune_in)(folder, flags)
 
 
 class _Run(NamedTuple):

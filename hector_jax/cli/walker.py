@@ -39,7 +39,7 @@ def run_check(args: Check) -> None:
     print_result(args.json, {"found": lines}, lambda: print(text))
 
 
-def tune_own(folder: Path, args: Tune) -> None:
+def tune_walker(folder: Path, args: Tune) -> None:
     """Tune on the walks of a program, from those in the folder on; compare start and `best`.
 
     Whether the start stays `best` is decided on plants that were not walked, and the table is of
@@ -85,7 +85,7 @@ def tune_own(folder: Path, args: Tune) -> None:
     write_json(folder / RESULT, result)
 
     def print_text() -> None:
-        print(*first_lines(whole, str(folder))[:2], "", sep="\n")  # how far off, and falls
+        print(*first_lines(whole, ""), "", sep="\n")
         for name, of in ({", ".join(by_name): whole} | by_name).items():
             print_table(of, f"{name}, {plural(len(seeds), 'plant')}", campaign.engine.title)
 

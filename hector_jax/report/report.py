@@ -120,11 +120,11 @@ def plain_errors(verdict: Verdict, name: str) -> dict[str, float]:
 
 
 def first_lines(verdict: Verdict, run: str) -> list[str]:
-    """Say in three lines what a run has come to: errors, falls, what to do next.
+    """Say in lines what a run has come to: errors, falls, what to do next.
 
     Args:
         verdict: on the stand-in, with `best` or, without it, a tuned set as its last one.
-        run: `latest` or the folder of the run.
+        run: `latest` or the folder of the run; empty if it can be neither viewed nor exported.
     """
     tuned = "best" if "best" in verdict.scores else list(verdict.scores)[-1]
     errors = {name: plain_errors(verdict, name) for name in (tuned, *baselines(verdict))}

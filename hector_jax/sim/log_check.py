@@ -42,8 +42,9 @@ class CheckedLog(NamedTuple):
     own: State | None  # reference in the log
     torque: Float[np.ndarray, "n joints"] | None  # as a share of the limits
     has_effect: bool
-    stance: Bool[np.ndarray, "n feet"]  # planned contact, or without it commanded load
-    astray: float  # share of the samples and feet whose planned contact is not that of the load
+    stance: Bool[np.ndarray, "n feet"]  # planned contact if it can be trusted, else commanded load
+    # share of samples and feet whose planned contact is not that of the load; None without contact
+    astray: float | None
 
     @property
     def weight(self) -> float:
@@ -54,11 +55,17 @@ class CheckedLog(NamedTuple):
 def read_check(
     path: Path, robot: Robot, command: Command, seconds: float, tick: float
 ) -> tuple[CheckedLog, str]:
-    """Read a log for `check_log`; returns also how the walk ended.
+    """Read a log for `check_log`; return also how the walk ended, as `read_walk` does.
+
+    Args:
+        path: file of the log, which may have `torque` (T, joints) [N m] too.
+        robot, command: that walked, and what was asked of it.
+        seconds: expected length.
+        tick: that of the gait [s].
 
     Raises:
-        InputError: see `read_walk`; or nothing of the walk is left after SETTLED, or `torque` has
-            another shape.
+        InputError: see `read_walk`; or less than SHORTEST is left of the walk, or `torque` is not
+            numbers of that shape.
     """
     whole, end = read_walk(path, robot, seconds, tick)
     with np.load(path) as archive:
@@ -69,7 +76,8 @@ def read_check(
     period, count = float(whole.period), int(np.sum(~whole.fallen))
     rows = slice(round(SETTLED / period), count - round(FALLING / period) * bool(end))
     if rows.stop - rows.start < SHORTEST / period:
-        raise InputError(f"{path}: ends after {count * period:.2f} s, too early to tell anything")
+        ended = end or f"lasts {count * period:.2f} s"
+        raise InputError(f"{path}: {ended}: too early to tell anything")
     reference = jax.tree.map(np.asarray, reference_of(tick, robot, command, whole))
     cut = partial(jax.tree.map, lambda x: np.asarray(x)[rows])
     own = cut(whole.reference) if "reference.position" in names else None
@@ -77,8 +85,8 @@ def read_check(
     walk = walk._replace(period=whole.period, initial=whole.initial)
     share = None if torque is None else torque[rows] / np.asarray(robot.torque_limit)
     loaded = walk.command.force[..., 2] > LOADED * float(robot.mass * robot.gravity[2])
-    astray = float(np.mean(walk.contact != loaded)) if "contact" in names else 0.0
-    stance = walk.contact if "contact" in names and astray <= ASTRAY else loaded
+    astray = float(np.mean(walk.contact != loaded)) if "contact" in names else None
+    stance = walk.contact if astray is not None and astray <= ASTRAY else loaded
     return CheckedLog(robot, walk, own, share, "effect.force" in names, stance, astray), end
 
 
@@ -117,7 +125,7 @@ def _middle(x: Float[np.ndarray, "n ..."], period: float) -> Float[np.ndarray, "
 
 def _contacts(log: CheckedLog, tick: float) -> Iterator[str]:
     """Are forces commanded where feet are planned to stand?"""
-    if log.astray > ASTRAY:
+    if log.astray is not None and log.astray > ASTRAY:
         yield (
             f"contact is not that of the feet with a commanded load in {100 * log.astray:.0f} % of "
             "the samples: its order of feet, or its meaning"
@@ -243,8 +251,10 @@ def _ground(log: CheckedLog, tick: float) -> Iterator[str]:
 
 def _air(log: CheckedLog, tick: float) -> Iterator[str]:
     """Are feet in the air free of commanded forces?"""
+    if log.astray is None or log.astray > ASTRAY:
+        return
     force = np.linalg.norm(log.walk.command.force, axis=-1)[~log.stance]
-    if log.stance is log.walk.contact and len(force) and force.mean() > IN_AIR * log.weight:
+    if len(force) and force.mean() > IN_AIR * log.weight:
         yield (
             f"feet in the air are commanded {force.mean():.0f} N in the mean: the plan's contacts "
             "are not those that are walked"
@@ -262,9 +272,8 @@ def _reference(log: CheckedLog, tick: float) -> Iterator[str]:
     """Does the controller know where it should be?"""
     if log.own is None:
         return
-    rms = lambda x: float(np.sqrt(np.mean(np.sum(x[:, :2] ** 2, axis=1))))  # noqa: E731
-    path, own = log.walk.reference.position, log.own.position
-    away, to_own = rms(log.walk.state.position - path), rms(log.walk.state.position - own)
+    state, path, own = (x.position[:, :2] for x in (log.walk.state, log.walk.reference, log.own))
+    away, to_own = (float(np.sqrt(2.0 * np.mean((state - x) ** 2))) for x in (path, own))
     if away > STEADY and to_own < FOLLOWS * away:
         yield (
             f"the robot is {100 * away:.0f} cm off the commanded path, {100 * to_own:.0f} cm off "

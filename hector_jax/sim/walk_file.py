@@ -42,12 +42,44 @@ def read_walk(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Tr
         InputError: one line naming the file and the entry that is missing, of another shape, or not
             of finite numbers; or its period is no part of a tick.
     """
+    walk, valid, wanted = _entries(path, robot, seconds, tick)
+    min_height, max_tilt = robot.description.limits
+    tilt = np.abs(walk.state.euler[:valid, :2]).max(axis=1)
+    tilt = np.where(walk.state.position[:valid, 2] >= min_height, tilt, 0.0)  # of an upright trunk
+    if tilt.max(initial=0.0) > np.pi or (tilt[:1] > max_tilt).any():
+        text = f"roll or pitch reaches {tilt.max():.3g} at full height"
+        raise InputError(f"{path}: {text}, expected radians")
+    count, period, rows = len(walk.joints), float(walk.period), np.arange(wanted)
+    cut = walk._replace(period=None, initial=None)
+    samples = jax.tree.map(lambda x: x[np.minimum(rows, valid - 1)], cut)
+    down = np.asarray(has_fallen(samples.state, min_height, max_tilt))
+    fallen = np.maximum.accumulate(down | samples.fallen) | (rows >= valid)
+    stood = int(np.argmax(fallen)) if fallen.any() else wanted
+    end = "" if stood == wanted else f"fell after {period * stood:.2f} s"
+    if end and stood == valid < count:
+        end = f"its state is no number from {period * stood:.2f} s on, which counts as a fall"
+    elif end and stood == count:
+        end = f"its log has {count} of {wanted} samples of {period:g} s, which counts as a fall"
+    yaw = np.unwrap(np.append(walk.initial.euler[2], samples.state.euler[:, 2]))[1:]
+    euler = np.column_stack([samples.state.euler[:, :2], yaw])
+    state = samples.state._replace(euler=euler)
+    return samples._replace(
+        period=walk.period, initial=walk.initial, state=state, fallen=fallen
+    ), end
+
+
+def _entries(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Trajectory, int, int]:
+    """Return the entries of a file; see `read_walk`.
+
+    Returns:
+        The samples of the file, the number of those before the state is no number, and the number
+        of samples that were expected.
+    """
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files if name != "card"}
     except Exception as error:  # a foreign archive can fail in any way
         raise InputError(f"{path}: not a log (.npz): {one_line(error)}") from None
-    empty = no_samples(len(robot.joint_lower), len(robot.foot_point))
     asked = "" if "period" in arrays else "; is period missing?"
     arrays = {"period": np.array(TIME_STEP)} | arrays
     if not _divides(period := arrays["period"], tick):
@@ -59,34 +91,13 @@ def read_walk(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Tr
     if not 1 <= count <= wanted:
         expected = f"{wanted} samples of joints in {seconds:g} s of {period:g} s"
         raise InputError(f"{path}: expected {expected}, got {count}{asked}")
-    walk = _checked(path, arrays, empty, count)
+    walk = _checked(path, arrays, no_samples(len(robot.joint_lower), len(robot.foot_point)), count)
     finite = np.all([np.isfinite(x).all(axis=1) for x in walk.state], axis=0)
     valid = count if finite.all() else int(np.argmin(finite))
     for name, x in named_leaves(walk).items():
         if not np.isfinite(x[: max(valid, 1)] if np.ndim(x) and len(x) == count else x).all():
             raise InputError(f"{path}: {name} must hold finite numbers")
-    min_height, max_tilt = robot.description.limits
-    tilt = np.abs(walk.state.euler[:valid, :2]).max(axis=1)
-    tilt = np.where(walk.state.position[:valid, 2] >= min_height, tilt, 0.0)  # of an upright trunk
-    if tilt.max(initial=0.0) > np.pi or (tilt[:1] > max_tilt).any():
-        text = f"roll or pitch reaches {tilt.max():.3g} at full height"
-        raise InputError(f"{path}: {text}, expected radians")
-    rows = np.minimum(np.arange(wanted), valid - 1)
-    samples = jax.tree.map(lambda x: x[rows], walk._replace(period=None, initial=None))
-    down = np.asarray(has_fallen(samples.state, min_height, max_tilt))
-    fallen = np.maximum.accumulate(down | samples.fallen) | (np.arange(wanted) >= valid)
-    stood = int(np.argmax(fallen)) if fallen.any() else wanted
-    end = "" if stood == wanted else f"fell after {period * stood:.2f} s"
-    if end and stood == valid < count:
-        end = f"its state is no number from {period * stood:.2f} s on, which counts as a fall"
-    elif end and stood == count:
-        end = f"its log has {count} of {wanted} samples of {period:g} s"
-        end = f"{end}, which counts as a fall{asked}"
-    yaw = np.unwrap(np.append(walk.initial.euler[2], samples.state.euler[:, 2]))[1:]
-    euler = np.column_stack([samples.state.euler[:, :2], yaw])
-    state = samples.state._replace(euler=euler)
-    initial, period = walk.initial, np.asarray(period)
-    return samples._replace(period=period, initial=initial, state=state, fallen=fallen), end
+    return walk._replace(period=np.asarray(period)), valid, wanted
 
 
 def _divides(period: np.ndarray, tick: float) -> bool:

@@ -30,6 +30,7 @@ import numpy as np
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.weights_file import weights_tree
 from hector_jax.core.console import say
+from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError, one_line
 from hector_jax.core.trajectory import Trajectory, no_samples
 from hector_jax.robot.model import Robot
@@ -45,16 +46,16 @@ class Walker(NamedTuple):
     path: Path
     limit: float  # [s] of a walk
     content: str  # hash of it and of Python files beside it: tells its walks from those of others
-    strict: bool  # a walk that the program does not make is an error, else a fall
+    strict: bool = True  # a walk that the program does not make is an error, else a fall
+    log: Path | None = None  # file for the log of its walk; None: it is not kept
 
 
-def walker_of(path: Path, limit: float, *, strict: bool = True) -> Walker:
+def walker_of(path: Path, limit: float) -> Walker:
     """Return the walker of a file.
 
     Args:
         path: an executable file, or a Python file, which this interpreter runs.
         limit: longest time that it may take for a walk [s].
-        strict: a walk that the program does not make is an error; else it counts as a fall.
 
     Raises:
         InputError: there is no such file, or it cannot be executed.
@@ -66,7 +67,7 @@ def walker_of(path: Path, limit: float, *, strict: bool = True) -> Walker:
         raise InputError(f"walker {path}: expected a Python file or an executable one (chmod +x)")
     files = sorted({path, *path.parent.glob("*.py")})
     content = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
-    return Walker(path, limit, content, strict)
+    return Walker(path, limit, content)
 
 
 def walker_engine(walker: Walker) -> Engine:
@@ -97,7 +98,7 @@ def _walk(
     batch: int = 0,
 ) -> Iterator[Trajectory]:
     if any(job.plant is not None for job in jobs):
-        raise InputError(f"{walker.path} has a robot of its own: --plant cannot be given")
+        raise InputError(f"{walker.path} has a robot of its own: Job.plant must be None")
     body, call = jax.tree.map(np.asarray, robot), map if pool is None else pool.map
     ends = call(_walk_once, repeat(walker), repeat(config), repeat(body), map(on_host, jobs))
     for job, (walk, end) in zip(jobs, ends, strict=True):
@@ -120,6 +121,8 @@ def _walk_once(
         log = Path(folder) / "log.npz"
         try:
             write_log(walker, job, log)
+            if walker.log is not None:
+                write_file(walker.log, log.read_bytes())
             walk, end = read_walk(log, robot, seconds, tick)
         except InputError as error:
             text = str(error).replace(f"{log}: ", f"{walker.path}: its log: ")
@@ -187,7 +190,7 @@ try:
     os.killpg(program.pid, signal.SIGKILL)
 except ProcessLookupError:
     pass
-sys.exit(124 if code is None else code)
+sys.exit(124 if code is None else code if code >= 0 else 128 - code)
 """
 
 
