@@ -50,6 +50,7 @@ for _command in (
     evaluate.run_walk,
     evaluate.run_grfm,
     walker.run_check,
+    walker.run_twin,
     propose.run_propose,
     propose.run_report,
     tune.run_tune,

@@ -6,7 +6,6 @@ from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, dataclass_transform
 
-from hector_jax.core.inputs import InputError, did_you_mean, short_repr
 from hector_jax.core.settings import SEED, Range
 
 T = TypeVar("T")
@@ -323,6 +322,16 @@ class Check(ForRobot, Printed):
 
 
 @_command
+class Twin(Check):
+    """Solve the plans of a log again, and say how far those of the robot's file are from them.
+
+    Example: hector twin mine.npz --robot mine.toml --traj straight --weights mine.json
+    """
+
+    weights: Weights = "nominal"  # with which the log was walked: a file, nominal, expert or best
+
+
+@_command
 class Robot(Flags):
     """Report what a robot's model holds and what is wrong with it, and propose its TOML file.
 
@@ -386,15 +395,3 @@ class Compare(Printed):
 
     runs: tuple[Run, ...]  # folders of runs of `hector tune`, or `latest`
     out: Path | None = None  # file for the comparison as JSON
-
-
-def command(word: str) -> type[Any]:
-    """Return the class of a command's flags.
-
-    Raises:
-        InputError: there is no such command.
-    """
-    if word not in COMMANDS:
-        hint = did_you_mean(word, COMMANDS) or f"; the commands are {', '.join(COMMANDS)}"
-        raise InputError(f"unknown command {short_repr(word)}{hint}")
-    return COMMANDS[word]

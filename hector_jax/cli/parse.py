@@ -18,7 +18,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from hector_jax.cli.flags import COMMANDS, NAMED_WEIGHTS, PathKind, command, named_file, with_given
+from hector_jax.cli.flags import COMMANDS, NAMED_WEIGHTS, PathKind, named_file, with_given
 from hector_jax.core.inputs import InputError, check_file, did_you_mean, one_line, short_repr
 from hector_jax.core.settings import SEED, convert, from_table, read_json, read_toml, to_table
 
@@ -37,6 +37,7 @@ OVERVIEW = {
     },
     "Tune on the walks of a robot, or of a simulator elsewhere": {
         "check": "what of the log of a walk no weights can mend",
+        "twin": "how far the plans of a robot's file are from those of a log",
         "propose": "the weights to walk with next",
         "report": "take the logs of these walks",
     },
@@ -68,6 +69,14 @@ Flags = TypeVar("Flags")
 # The line
 
 
+def _command(word: str) -> type[Any]:
+    """Return the class of a command's flags, or raise InputError."""
+    if word not in COMMANDS:
+        hint = did_you_mean(word, COMMANDS) or f"; the commands are {', '.join(COMMANDS)}"
+        raise InputError(f"unknown command {short_repr(word)}{hint}")
+    return COMMANDS[word]
+
+
 def from_line(words: Sequence[str]) -> Any:
     """Read a command and its flags from the words after `hector`.
 
@@ -85,7 +94,7 @@ def from_line(words: Sequence[str]) -> Any:
     if not name:
         print(overview())
         raise SystemExit(0)
-    return read_flags(command(name), [*rest, *helps], f"hector {name}")
+    return read_flags(_command(name), [*rest, *helps], f"hector {name}")
 
 
 def read_flags(kind: type[Flags], words: Sequence[str], program: str) -> Flags:

@@ -1,12 +1,15 @@
-"""A controller of the user: what the logs of its walks show, and a tuning on its walks."""
+"""A controller of the user: what the logs of its walks show, its twin, a tuning on its walks."""
 
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
+
 from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.arguments import print_result
-from hector_jax.cli.flags import Check, Tune
+from hector_jax.cli.flags import Check, Tune, Twin
 from hector_jax.control.controller import walk_config
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.console import say
@@ -14,10 +17,13 @@ from hector_jax.core.environment import environment
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
+from hector_jax.core.trajectory import FEET
 from hector_jax.report.report import first_lines, print_table
-from hector_jax.robot.model import load_robot
+from hector_jax.robot.model import Robot, load_robot
 from hector_jax.sim.log_check import check_log, read_check
 from hector_jax.sim.loop import Job
+from hector_jax.sim.parity import COMPONENTS, Parity, compare_plans
+from hector_jax.sim.walk_file import read_walk
 from hector_jax.sim.walker import walker_of, write_log
 from hector_jax.sim.world import hfs
 from hector_jax.store import tunings
@@ -32,11 +38,59 @@ def run_check(args: Check) -> None:
     """Say what of a log no weights can mend."""
     robot = load_robot(args.robot)
     trajectory = arguments.load_trajectory(args.traj, robot)
-    seconds, tick = arguments.walk_seconds(args, trajectory), walk_config(robot).gait.tick
-    log, end = read_check(args.log, robot, trajectory.command, seconds, tick)
-    lines = [*([end] if end else []), *check_log(log, tick)]
+    seconds, config = arguments.walk_seconds(args, trajectory), walk_config(robot)
+    log, end = read_check(args.log, robot, trajectory.command, seconds, config.gait.tick)
+    lines = [*([end] if end else []), *check_log(log, config.plan_interval)]
     text = "\n".join(lines or ["nothing is found that weights could not mend"])
     print_result(args.json, {"found": lines}, lambda: print(text))
+
+
+def run_twin(args: Twin) -> None:
+    """Say how far the plans of a log are from those of the robot's file."""
+    robot = load_robot(args.robot)
+    config, trajectory = walk_config(robot), arguments.load_trajectory(args.traj, robot)
+    seconds = arguments.walk_seconds(args, trajectory)
+    walk, _ = read_walk(args.log, robot, seconds, config.gait.tick)
+    weights = arguments.weights_by_name(args.weights, robot)
+    parity = compare_plans(config, robot, weights, trajectory.command, walk)
+    plan, foot, axis = parity.worst
+    at_worst = {"at": parity.time[plan], "foot": int(foot), "component": COMPONENTS[axis]}
+    at_worst |= {"logged": parity.logged[tuple(parity.worst)]}
+    at_worst |= {"twin": parity.twin[tuple(parity.worst)]}
+    result = {
+        "plans": len(parity.time),
+        **{name: _quantiles(parity, i) for i, name in enumerate(COMPONENTS)},
+        "worst": at_worst,
+        "other_contact": parity.other_contact,
+        "unsolved": parity.unsolved,
+    }
+    print_result(args.json, result, lambda: print(*_parity_lines(parity, robot), sep="\n"))
+
+
+def _quantiles(parity: Parity, component: int) -> dict[str, float]:
+    distance = parity.distance[:, :, component]
+    names, shares = ("median", "99 %", "worst"), (0.5, 0.99, 1.0)
+    return {n: float(np.quantile(distance, q)) for n, q in zip(names, shares, strict=True)}
+
+
+def _parity_lines(parity: Parity, robot: Robot) -> Iterator[str]:
+    """Return the lines that `hector twin` prints."""
+    yield f"{plural(len(parity.time), 'plan')}; differences in N and N m, world frame"
+    yield f"{'':5}{'median':>10}{'99 %':>10}{'worst':>10}"
+    for i, name in enumerate(COMPONENTS):
+        yield f"{name:5}" + "".join(f"{x:10.2g}" for x in _quantiles(parity, i).values())
+    plan, foot, axis = parity.worst
+    logged, twin = (x[tuple(parity.worst)] for x in (parity.logged, parity.twin))
+    side = FEET[len(robot.foot_point)][foot].replace("_", " ")
+    yield (
+        f"most at {parity.time[plan]:.3f} s, {side} foot, {COMPONENTS[axis]}: {logged:.6g} in the "
+        f"log, {twin:.6g} of the twin"
+    )
+    if parity.other_contact:
+        share = 100 * parity.other_contact
+        yield f"in {share:.0f} % of the plans the log has other feet on the floor: see [gait]"
+    if parity.unsolved:
+        yield f"{plural(parity.unsolved, 'plan')} of the twin not solved"
 
 
 def tune_walker(folder: Path, args: Tune) -> None:
@@ -100,13 +154,13 @@ def _check_first(args: Tune, campaign: Campaign, seconds: float) -> None:
     assert args.walker is not None
     (name, command), *_ = campaign.commands.items()
     job = Job(campaign.start, command, campaign.plants[0] or hfs(), seconds)
-    tick = campaign.config.rollout.walk.gait.tick
+    walk = campaign.config.rollout.walk
     with TemporaryDirectory() as folder:
         path = Path(folder) / "first.npz"
         write_log(walker_of(args.walker, args.walker_limit), job, path)
         try:
-            log, end = read_check(path, campaign.robot, command, seconds, tick)
+            log, end = read_check(path, campaign.robot, command, seconds, walk.gait.tick)
         except InputError as error:
             raise InputError(str(error).replace(str(path), f"{args.walker}: its log")) from None
-    for line in [*([end] if end else []), *check_log(log, tick)]:
+    for line in [*([end] if end else []), *check_log(log, walk.plan_interval)]:
         say(f"before any tuning, {name}: {line}")

@@ -27,7 +27,8 @@ Constraints of a flat foot, in addition to the first three, with half width w:
 
 and instead of TORSION, for feet that need large yaw moments, CORNER_FRICTION: the wrench is a sum
 of forces at the four corners, each within the foot-aligned square inscribed in the friction pyramid
-(Caron, Pham, Nakamura 2015).
+(Caron, Pham, Nakamura 2015). Other controllers have BOX_FRICTION, |F_x|, |F_y| <= mu F_z along and
+across the foot, and TWIST, |M_z| <= twist F_z.
 
 Differences from the paper: toe and heel of the line foot are in their physical places (pressure at
 the toe gives M_y = -l_t F_z; the paper prints them swapped). Toe and heel each satisfy friction,
@@ -94,6 +95,7 @@ class Contact(NamedTuple):
     robot: Robot
     friction: Any  # mu
     max_force: Any  # [N]
+    twist: Any = 0.0  # [m] of TWIST
 
 
 class Step(NamedTuple):
@@ -249,7 +251,21 @@ def _corner_friction(contact: Contact) -> Rows:
     return _by_sign([1, -1], A)
 
 
+def _box_friction(contact: Contact) -> Rows:
+    (fx, fy, fz), mu = contact.force, contact.friction
+    sin, cos = jnp.sin(contact.yaw), jnp.cos(contact.yaw)
+    sides = (cos * fx + sin * fy, cos * fy - sin * fx)
+    return _by_sign([-1, 1], [side + sign * mu * fz for side in sides for sign in (-1, 1)])
+
+
+def _twist(contact: Contact) -> Rows:
+    fz, mz = contact.force[2], contact.moment[2]
+    return _by_sign([1, -1], [mz + contact.twist * fz, mz - contact.twist * fz])
+
+
 FRICTION = InputConstraint("friction", of=_friction)
+BOX_FRICTION = InputConstraint("box_friction", of=_box_friction)
+TWIST = InputConstraint("twist", of=_twist)
 UNILATERAL_FORCE = InputConstraint("unilateral_force", of=_unilateral_force)
 LINE_PRESSURE = InputConstraint("line_pressure", of=_line_pressure)
 LINE_FRICTION = InputConstraint("line_friction", of=_line_friction)
@@ -259,7 +275,7 @@ CORNER_FRICTION = InputConstraint("corner_friction", of=_corner_friction)
 _POINT = (FRICTION, UNILATERAL_FORCE)
 _LINE = (*_POINT, LINE_PRESSURE, LINE_FRICTION)
 _FLAT = (*_POINT, LINE_PRESSURE, SIDE_PRESSURE, TORSION)
-Constraint.known = (*_LINE, SIDE_PRESSURE, TORSION, CORNER_FRICTION)
+Constraint.known = (*_LINE, SIDE_PRESSURE, TORSION, CORNER_FRICTION, BOX_FRICTION, TWIST)
 
 POINT_FOOT = ContactModel("point", components=(0, 1, 2), constraints=_POINT)
 LINE_FOOT = ContactModel("line", components=(0, 1, 2, 4, 5), constraints=_LINE)

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from hector_jax import qp
 from hector_jax.control import footstep, gait, legs
 from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance, integrate_error
 from hector_jax.control.footstep import Feet, FootstepConfig, FootstepParameters
@@ -24,6 +25,7 @@ from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
 from hector_jax.control.parameters import TUNABLES, Parameters
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.slip import Grip, SlipConfig, feel, first_grip
+from hector_jax.control.twin import ReferenceInputs, TwinConfig
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rotation_from_euler, wrap_angle
@@ -44,6 +46,7 @@ class WalkConfig:
     footstep: FootstepConfig = FootstepConfig()
     legs: LegConfig = LegConfig()
     slip: SlipConfig = SlipConfig()
+    twin: TwinConfig = TwinConfig()
 
     def __post_init__(self) -> None:
         check(self)
@@ -72,6 +75,11 @@ class WalkConfig:
     def mpc_step(self) -> float:
         """MPC step dt [s]."""
         return self.mpc.step_ticks * self.gait.tick
+
+    @property
+    def plan_interval(self) -> float:
+        """Time from plan to plan [s]."""
+        return self.twin.plan_ticks * self.gait.tick
 
     @property
     def touchdowns(self) -> int:
@@ -113,6 +121,7 @@ class Memory(NamedTuple):
     liftoff: Feet  # last stance of each foot
     disturbance: Disturbance
     grip: Grip
+    wrench: Wrench  # planned last
 
 
 class Plan(NamedTuple):
@@ -127,9 +136,9 @@ class Plan(NamedTuple):
 
 
 def contacts_needed(config: WalkConfig, tick: int) -> int:
-    """Return the largest number of stance feet in a plan: all feet before the gait starts."""
-    gait = config.gait
-    return len(gait.offsets) if tick < gait.first_tick else gait.most_contacts
+    """Return the largest number of feet with inputs in a plan: all before the gait starts."""
+    gait, every = config.gait, config.twin.air_moments
+    return len(gait.offsets) if every or tick < gait.first_tick else gait.most_contacts
 
 
 def plan_horizon(
@@ -154,38 +163,34 @@ def plan_horizon(
 
     Source: Eq. 6, 14-16.
     """
-    ticks = config.gait
+    ticks, twin = config.gait, config.twin
     steps = tick + config.mpc.step_ticks * jnp.arange(config.mpc.horizon + 1)
-    reference = jax.vmap(lambda t: reference_at(ticks.tick, command, anchor, t))(steps)
+    reference = twin.reference.of(ticks.tick, ReferenceInputs(command, anchor, steps, state))
     current = jax.tree.map(lambda r: r[0], reference)
 
-    # Step 0 takes the current contact, a later step the contact at the middle of its interval.
-    middles = jnp.concatenate([tick[None], steps[1:-1] + config.mpc.step_ticks // 2])
-    count = gait.touchdowns(ticks, tick, middles)
+    # step 0 takes the current contact
+    inside = steps[1:-1] + int(twin.contact_at * config.mpc.step_ticks)
+    times = jnp.concatenate([tick[None], inside])
+    count = gait.touchdowns(ticks, tick, times)
     wait = gait.ticks_to_touchdown(ticks, tick)
-    times = {"stance": ticks.tick * ticks.stance, "swing": ticks.tick * ticks.swing}
-    touch = partial(footstep.touchdown_points, config.footstep, robot, parameters, **times)
+    lengths = {"stance": ticks.tick * ticks.stance, "swing": ticks.tick * ticks.swing}
+    touch = partial(footstep.touchdown_points, config.footstep, robot, parameters, **lengths)
     touchdowns = [
         touch(state=state, reference=current, remaining=ticks.tick * (wait + number * ticks.cycle))
         for number in range(config.touchdowns)
     ]
-    foot_points, foot_yaw = feet
+    points, yaw = feet
     for number, touchdown in enumerate(touchdowns):
         landed = count > number
-        foot_points = jnp.where(landed[..., None], touchdown.position, foot_points)
-        foot_yaw = jnp.where(landed, touchdown.yaw, foot_yaw)
-
-    # Linearise about the reference motion shifted to the current pose, so that the levers are right
-    # under a tracking error.
-    start = jax.tree.map(lambda r: r[:-1], reference)
-    path = state.position + start.position - current.position
-    heading = state.euler[2] + start.euler[:, 2] - current.euler[2]
+        points = jnp.where(landed[..., None], touchdown.position, points)
+        yaw = jnp.where(landed, touchdown.yaw, yaw)
+    targets = np.maximum(np.arange(1, len(steps)) - twin.late, 0)
+    contact = gait.contact(ticks, times)
     horizon = Horizon(
-        reference=jax.tree.map(lambda r: r[1:], reference),
-        euler=jnp.zeros_like(start.euler).at[:, 2].set(heading),
-        lever=foot_points - path[:, None],
-        foot_yaw=foot_yaw,
-        contact=gait.contact(ticks, middles),
+        jax.tree.map(lambda r: r[targets], reference),
+        *twin.linearisation.of(state, feet, reference, Feet(points, yaw)),
+        contact=contact,
+        inputs=jnp.ones_like(contact) if twin.air_moments else None,
     )
     return horizon, touchdowns[0]
 
@@ -221,6 +226,7 @@ def plan(
     state: State,
     feet: Feet,
     disturbance: Disturbance = NO_DISTURBANCE,
+    last: Wrench | None = None,
     max_contacts: int = 1,
 ) -> tuple[Plan, Disturbance]:
     """Solve the MPC for one tick.
@@ -232,6 +238,7 @@ def plan(
         state: current base state.
         feet: current foot points; those of feet in the air are not used.
         disturbance: from the previous plan.
+        last: wrench of the previous plan, which is kept between plans of several ticks; None: plan.
         max_contacts: from `contacts_needed` (static).
 
     Returns:
@@ -249,16 +256,31 @@ def plan(
         state=state,
         feet=feet,
     )
-    dt = config.gait.tick
+    dt, every = config.gait.tick, config.twin.plan_ticks
     reference = reference_at(dt, command, anchor, tick)
     horizon = limit_distance(horizon, state, reference, parameters.mpc.position_limit)
     disturbance = integrate_error(parameters.mpc.integral, disturbance, state, reference, dt)
-    problem = MpcProblem(robot, parameters.mpc, state, horizon, disturbance)
-    wrench, solution = solve_mpc(config.mpc, problem, dt=config.mpc_step, max_contacts=max_contacts)
-    residual = jnp.maximum(solution.primal_residual, solution.dual_residual)
-    residual = jnp.maximum(residual, solution.gap)
+    body = config.twin.body(robot)
+    problem = MpcProblem(body, parameters.mpc, state, horizon, disturbance)
     contact, swing_ticks = gait.contact(config.gait, tick), gait.swing_ticks(config.gait, tick)
-    return Plan(wrench, contact, touchdown, swing_ticks, residual, solution.status), disturbance
+
+    def solve() -> tuple[Wrench, Float[Array, ""], Int[Array, ""]]:
+        wrench, solution = solve_mpc(
+            config.mpc, problem, dt=config.mpc_step, max_contacts=max_contacts
+        )
+        residual = jnp.maximum(solution.primal_residual, solution.dual_residual)
+        return wrench, jnp.maximum(residual, solution.gap), solution.status
+
+    if last is None or every == 1:
+        solved = solve()
+    else:
+        kept = jax.tree.map(jnp.asarray, (last, 0.0, qp.Status.SOLVED))
+        kept = jax.tree.map(lambda x, like: x.astype(like.dtype), kept, jax.eval_shape(solve))
+        solved = jax.lax.cond(tick % every == 0, solve, lambda: kept)
+    wrench, residual, status = solved
+    if config.twin != TwinConfig():  # a foot in the air exerts nothing
+        wrench = jax.tree.map(lambda x: contact[:, None] * x, wrench)
+    return Plan(wrench, contact, touchdown, swing_ticks, residual, status), disturbance
 
 
 def measured_feet(robot: Robot, measurement: Measurement) -> Feet:
@@ -274,7 +296,8 @@ def measured_feet(robot: Robot, measurement: Measurement) -> Feet:
 def init_memory(robot: Robot, measurement: Measurement) -> Memory:
     """Return the memory of a standing robot."""
     feet = measured_feet(robot, measurement)
-    return Memory(feet, NO_DISTURBANCE, first_grip(feet.position))
+    none = Wrench(jnp.zeros_like(feet.position), jnp.zeros_like(feet.position))
+    return Memory(feet, NO_DISTURBANCE, first_grip(feet.position), none)
 
 
 def step_plan(
@@ -304,10 +327,11 @@ def step_plan(
         state=measurement.state,
         feet=feet,
         disturbance=memory.disturbance,
+        last=memory.wrench,
         max_contacts=max_contacts,
     )
     liftoff = footstep.feet_where(planned.contact, feet, memory.liftoff)
-    return Memory(liftoff, disturbance, grip), planned
+    return Memory(liftoff, disturbance, grip, planned.wrench), planned
 
 
 def actuate(

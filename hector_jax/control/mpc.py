@@ -11,7 +11,7 @@ the inputs of the others have zero columns and a unit Hessian, so that shapes st
 
 Differences from the paper: the cost is on x_1..x_N instead of x_0..x_{N-1}, because x_0 is given; a
 foot in the air has no M_z; the reference may be shifted towards the robot, see `controller`;
-see also `contact`.
+see also `contact` and `twin`.
 """
 
 import math
@@ -72,6 +72,7 @@ class MpcConfig:
     sole_width: Annotated[float, SHARE] = 1.0
     # shares of the robot's inertia about the trunk's x, y and z with which the plan turns it
     inertia_share: tuple[float, ...] = (1.0, 1.0, 1.0)
+    twist: Annotated[float, NOT_NEGATIVE] = 0.03  # [m] M_z per F_z, of the constraint "twist"
     line_friction: bool = True  # False removes LINE_FRICTION from the constraints
     effort_reference: str = "zero"  # cost on u (paper); "gravity": on u minus the weight's share
     position_limit: float | None = None  # [m] largest horizontal error that counts; None: any
@@ -88,9 +89,8 @@ class MpcConfig:
     def __post_init__(self) -> None:
         share, words = Range(0.0, 1.0, above=True), ("zero", "gravity")
         check(self, position_limit=POSITIVE, effort_reference=words, inertia_share=share)
-        if len(self.inertia_share) != 3:
-            got = short_repr(self.inertia_share)
-            raise InputError(f"MpcConfig.inertia_share must be 3 numbers, got {got}")
+        if len(got := self.inertia_share) != 3:
+            raise InputError(f"MpcConfig.inertia_share must be 3 numbers, got {short_repr(got)}")
         object.__setattr__(self, "constraints", self.constraints or self.contact.constraints)
         if not self.on("inputs"):
             text = "MpcConfig.constraints must have one on the inputs, or feet can pull"
@@ -98,22 +98,18 @@ class MpcConfig:
 
     def parameters(self, weights: Weights) -> MpcParameters:
         """Return the traced numbers."""
-        gains = IntegralGains(self.horizontal_gain, self.height_gain, self.tilt_gain, self.yaw_gain)
+        gains = self.horizontal_gain, self.height_gain, self.tilt_gain, self.yaw_gain
         return MpcParameters(
             weights,
             friction=self.friction,
             max_force=self.max_force,
             effort_reference=float(self.effort_reference == "gravity"),
             position_limit=math.inf if self.position_limit is None else self.position_limit,
-            integral=gains,
+            integral=IntegralGains(*gains),
         )
 
-    def planned_inertia(
-        self, inertia: Float[Array | np.ndarray, "3 3"]
-    ) -> Float[Array | np.ndarray, "3 3"]:
+    def planned_inertia(self, inertia: Float[Any, "3 3"]) -> Float[Any, "3 3"]:
         """Return the inertia [kg m^2] that the plan turns, from that of the whole robot."""
-        if self.inertia_share == (1.0, 1.0, 1.0):
-            return inertia
         root = np.sqrt(self.inertia_share)
         return inertia * np.outer(root, root).astype(inertia.dtype)
 
@@ -131,6 +127,7 @@ class Horizon(NamedTuple):
     lever: Float[Array, "N feet 3"]  # centre of mass to foot points [m]
     foot_yaw: Float[Array, "N feet"]  # [rad]
     contact: Bool[Array, "N feet"]
+    inputs: Bool[Array, "N feet"] | None = None  # feet that have inputs; None: those in contact
 
 
 class MpcProblem(NamedTuple):
@@ -192,7 +189,8 @@ def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: in
     dtype = jnp.result_type(*jax.tree.leaves(data), jnp.float32)
     robot = robot._replace(inertia=config.planned_inertia(robot.inertia))
     A, B = jax.vmap(lambda e, r: srbm.linearise(robot, e, r, dt))(horizon.euler, horizon.lever)
-    feet = jax.vmap(lambda c: feet_of_contacts(c.astype(dtype), max_contacts))(horizon.contact)
+    inputs = horizon.contact if horizon.inputs is None else horizon.inputs
+    feet = jax.vmap(lambda c: feet_of_contacts(c.astype(dtype), max_contacts))(inputs)
     G = jax.vmap(partial(_input_map, config.contact))(feet, horizon.foot_yaw)
     # inputs change rates and velocities, which persist; angles and positions integrate them
     changes = B[:, 6:9], B[:, 9:12]
@@ -290,18 +288,20 @@ def _on_contacts(
 ) -> tuple[Array, ...]:
     """Return rows of parts on inputs, block-diagonal by step (N, rows, b), and their numbers."""
     feet, (robot, parameters, _, horizon, _) = condensed.feet, problem
-    selection = jnp.asarray(config.contact.selection, feet.dtype)
+    select = jnp.asarray(config.contact.selection, feet.dtype)
     robot = robot._replace(half_width=config.sole_width * robot.half_width)
 
-    def of_contact(yaw: Float[Array, ""]) -> tuple[Array, ...]:
-        contact = Contact(
-            selection[:3], selection[3:], yaw, robot, parameters.friction, parameters.max_force
-        )
+    def of_contact(yaw: Float[Array, ""], max_force: Float[Array, ""]) -> tuple[Array, ...]:
+        limits = parameters.friction, max_force, config.twist
+        contact = Contact(select[:3], select[3:], yaw, robot, *limits)
         each = [rows(part, contact, feet) for part in parts]
         return tuple(map(jnp.concatenate, zip(*each, strict=True)))
 
-    yaw = contract("ksf,kf->ks", feet, horizon.foot_yaw)
-    A, *numbers = jax.vmap(jax.vmap(of_contact))(yaw)
+    yaw, stands = contract("ksf,kf->ks", feet, horizon.foot_yaw), 1.0
+    if horizon.inputs is not None:  # the force of a foot in the air is zero by its rows
+        stands = contract("ksf,kf->ks", feet, horizon.contact.astype(feet.dtype))
+    max_force = jnp.broadcast_to(stands * parameters.max_force, yaw.shape)
+    A, *numbers = jax.vmap(jax.vmap(of_contact))(yaw, max_force)
     N, contacts = yaw.shape
     A = contract("st,ksri->ksrti", jnp.eye(contacts, dtype=feet.dtype), A)
     return A.reshape(N, -1, condensed.inputs.shape[-1]), *numbers

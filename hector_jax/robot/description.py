@@ -14,7 +14,7 @@
     left, right = { body, contacts = [[x, y, z], ...], point = [x, y, z] }   # as many
     [limits]
     min_height, max_tilt               # [m] of the centre of mass, [rad]: beyond them it has fallen
-    [gait] [mpc] [slip] [footstep] [legs]  # fields of GaitConfig, MpcConfig, SlipConfig and so on
+    [gait] [mpc] [slip] [footstep] [legs] [twin]  # fields of GaitConfig, MpcConfig and so on
     [weights]                          # each an x, y, z triple or a single number
     nominal, expert = { euler, position, ang_velocity, velocity, force, moment }
     [loss]                             # weights of the loss terms: L_Eul, L_pos, L_ctrl
@@ -44,7 +44,7 @@ DESCRIPTION_PATH = _ASSETS / "hector.toml"
 
 LEG_JOINTS = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle")
 FEWEST_JOINTS, MOST_JOINTS = 3, 7  # of a leg
-CONTROL = ("gait", "mpc", "slip", "footstep", "legs")  # sections that the controller reads
+CONTROL = ("gait", "mpc", "slip", "footstep", "legs", "twin")  # sections that the controller reads
 
 MAX_BYTES = 100_000
 
@@ -317,6 +317,7 @@ class _File:
     slip: dict | None = None
     footstep: dict | None = None
     legs: dict | None = None
+    twin: dict | None = None
     weights: _Weights = _Weights()
     loss: dict[str, float] | None = None
     tuning: TuningSettings = TuningSettings()
@@ -326,9 +327,8 @@ class _File:
         legs, feet = tuple(self.joints.legs), self.feet and tuple(self.feet.feet)
         if legs != (feet or FEET[2]):
             got = f"{', '.join(feet)} in feet" if feet else "no [feet]"
-            raise InputError(
-                f"joints has the legs {', '.join(legs)}, expected them in feet, got {got}"
-            )
+            text = f"joints has the legs {', '.join(legs)}, expected them in feet"
+            raise InputError(f"{text}, got {got}")
         angles = self.standing.values() if isinstance(self.standing, dict) else ()
         if not all(map(math.isfinite, angles)):
             raise InputError(f"standing must be finite angles, got {short_repr(self.standing)}")

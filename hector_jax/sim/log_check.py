@@ -95,7 +95,7 @@ def check_log(log: CheckedLog, tick: float) -> list[str]:
 
     Args:
         log: of `read_check`.
-        tick: interval of this project's plans [s].
+        tick: interval of the plans [s].
     """
     if (force := log.walk.command.force[..., 2].sum(axis=1).mean()) < 0.0:
         return [

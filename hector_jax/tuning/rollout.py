@@ -220,6 +220,7 @@ def step_carry(
         state=estimated_state,
         feet=estimated_feet,
         disturbance=carry.disturbance,
+        last=jax.tree.map(lambda w: w[0], carry.commands),
         max_contacts=contacts_needed(walk, 0),
     )
     planned = planned if wrench is None else planned._replace(wrench=wrench)

@@ -1,0 +1,140 @@
+"""What differs in the MPC of another controller: its twin is this project's MPC with that.
+
+A controller that shares the MPC of `mpc` may predict otherwise: from another reference, with a
+frozen linearisation, with contacts looked up elsewhere in a step, in plans of several ticks, with
+another mass. Each is a part or a number of `TwinConfig`, the section [twin] of the robot's file;
+the defaults are the MPC of this project. `sim.parity` says how far the plans of both are apart.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from hector_jax.control.footstep import Feet
+from hector_jax.control.reference import Anchor, Command, reference_at
+from hector_jax.core.arrays import Array, contract
+from hector_jax.core.geometry import rot_z
+from hector_jax.core.inputs import InputError, short_repr
+from hector_jax.core.part import Part
+from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SHARE, check
+from hector_jax.core.trajectory import State
+from hector_jax.robot.model import Robot
+
+
+class ReferenceInputs(NamedTuple):
+    """Arguments of a reference rule."""
+
+    command: Command
+    anchor: Anchor
+    ticks: Int[Array, " steps"]  # gait ticks, the present one and those at the end of each step
+    state: State  # of the robot
+
+
+class ReferenceRule(Part):
+    """Where the MPC wants the robot to be, `of(tick_length, inputs)`: a State (steps, 3)."""
+
+    of: Callable[[float, ReferenceInputs], State]
+
+
+def _path(tick_length: float, inputs: ReferenceInputs) -> State:
+    command, anchor, ticks, _ = inputs
+    return jax.vmap(lambda tick: reference_at(tick_length, command, anchor, tick))(ticks)
+
+
+def _from_robot(tick_length: float, inputs: ReferenceInputs) -> State:
+    command, anchor, ticks, state = inputs
+    now = reference_at(tick_length, command, anchor, ticks[0])
+    dt, steps = tick_length * (ticks[1] - ticks[0]), jnp.arange(len(ticks))
+    yaw = state.euler[2] + dt * steps * now.ang_velocity[2]
+    turn = jax.vmap(rot_z)(yaw - now.euler[2])
+    velocity = contract("kxy,y->kx", turn, now.velocity)
+    way = dt * (jnp.cumsum(velocity, axis=0) - velocity)  # forward Euler
+    return State(
+        euler=jnp.zeros_like(way).at[:, 2].set(yaw),
+        position=way + state.position.at[2].set(now.position[2]),
+        ang_velocity=jnp.broadcast_to(now.ang_velocity, way.shape),
+        velocity=velocity,
+    )
+
+
+PATH = ReferenceRule("path", of=_path)
+"""The commanded path, whatever the robot does."""
+
+FROM_ROBOT = ReferenceRule("from_robot", of=_from_robot)
+"""From x, y and yaw of the robot on with the present command; height as commanded."""
+
+ReferenceRule.known = (PATH, FROM_ROBOT)
+
+
+class Around(NamedTuple):
+    """The motion about which the dynamics of each step are linear."""
+
+    euler: Float[Array, "N 3"]  # [rad]
+    lever: Float[Array, "N feet 3"]  # centre of mass to foot points [m]
+    foot_yaw: Float[Array, "N feet"]  # [rad]
+
+
+class Linearisation(Part):
+    """Where the dynamics are linearised, `of(state, feet, reference, planned)`.
+
+    Its arguments are the present state and feet, the reference (N + 1, 3) and the feet of each
+    step (N, feet) with the touchdowns within the horizon.
+    """
+
+    of: Callable[[State, Feet, State, Feet], Around]
+
+
+def _along_reference(state: State, feet: Feet, reference: State, planned: Feet) -> Around:
+    # the reference motion shifted to the current pose: the levers are right under a tracking error
+    current, start = (jax.tree.map(lambda r, s=s: r[s], reference) for s in (0, slice(0, -1)))
+    path = state.position + start.position - current.position
+    heading = state.euler[2] + start.euler[:, 2] - current.euler[2]
+    euler = jnp.zeros_like(start.euler).at[:, 2].set(heading)
+    return Around(euler, planned.position - path[:, None], planned.yaw)
+
+
+def _frozen(state: State, feet: Feet, reference: State, planned: Feet) -> Around:
+    now = Around(state.euler, feet.position - state.position, feet.yaw)
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (len(planned.yaw), *x.shape)), now)
+
+
+ALONG_REFERENCE = Linearisation("along_reference", of=_along_reference)
+"""At the yaw of the reference, with the feet of each step."""
+
+FROZEN = Linearisation("frozen", of=_frozen)
+"""At the present attitude with the present feet, for all steps."""
+
+Linearisation.known = (ALONG_REFERENCE, FROZEN)
+
+
+@dataclass(frozen=True)
+class TwinConfig:
+    """How the MPC predicts and how often it plans; the defaults are those of this project."""
+
+    reference: ReferenceRule = PATH
+    late: Annotated[int, NOT_NEGATIVE] = 0  # steps by which the target of a step is that before it
+    linearisation: Linearisation = ALONG_REFERENCE
+    contact_at: Annotated[float, SHARE] = 0.5  # share of a step at which its contacts are read
+    plan_ticks: Annotated[int, AT_LEAST_ONE] = 1  # gait ticks from plan to plan
+    air_moments: bool = False  # feet in the air have inputs too; constraints make their force zero
+    mass: float | None = None  # [kg]; None: the robot's, as for what follows
+    inertia: tuple[float, ...] | None = None  # [kg m^2] about the trunk's x, y and z
+    toe: float | None = None  # [m] ahead of the foot point; heel behind it
+    heel: float | None = None
+
+    def __post_init__(self) -> None:
+        check(self, mass=POSITIVE, inertia=POSITIVE, toe=NOT_NEGATIVE, heel=NOT_NEGATIVE)
+        if self.inertia is not None and len(self.inertia) != 3:
+            got = short_repr(self.inertia)
+            raise InputError(f"TwinConfig.inertia must be 3 numbers, got {got}")
+
+    def body(self, robot: Robot) -> Robot:
+        """Return the robot as the MPC takes it to be."""
+        given = {name: getattr(self, name) for name in ("mass", "toe", "heel")}
+        given["inertia"] = None if self.inertia is None else np.diag(self.inertia)
+        return robot._replace(**{name: x for name, x in given.items() if x is not None})

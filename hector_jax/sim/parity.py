@@ -1,0 +1,105 @@
+"""How far the plans of a twin are from those of the controller that it stands for (`control.twin`).
+
+Every plan of a log is solved again, from the state and the joints at its start.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from hector_jax.control.controller import WalkConfig, contacts_needed, measured_feet, plan
+from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
+from hector_jax.control.legs import Measurement
+from hector_jax.control.reference import Command, anchor_at
+from hector_jax.control.weights import Weights
+from hector_jax.core.arrays import Array
+from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import SOLVED, Trajectory, Wrench
+from hector_jax.robot.model import Robot
+
+COMPONENTS = ("F_x", "F_y", "F_z", "M_x", "M_y", "M_z")
+
+
+class Parity(NamedTuple):
+    """Plans of a log and of the twin; world frame."""
+
+    time: Float[np.ndarray, " plans"]  # [s]
+    logged: Float[np.ndarray, "plans feet 6"]  # wrenches [N, N m] of the feet that stand
+    twin: Float[np.ndarray, "plans feet 6"]
+    other_contact: float  # share of the plans in which other feet stand
+    unsolved: int  # plans of the twin
+
+    @property
+    def distance(self) -> Float[np.ndarray, "plans feet 6"]:
+        """Absolute differences [N, N m]."""
+        return np.abs(self.logged - self.twin)
+
+    @property
+    def worst(self) -> Int[np.ndarray, "3"]:
+        """Plan, foot and component of the largest difference."""
+        return np.array(np.unravel_index(np.argmax(self.distance), self.distance.shape))
+
+
+def compare_plans(
+    config: WalkConfig, robot: Robot, weights: Weights, command: Command, walk: Trajectory
+) -> Parity:
+    """Solve the plans of a walk again.
+
+    Args:
+        config, robot: of the twin.
+        weights, command: with which the controller walked.
+        walk: as `read_walk` returns it. A plan is at t = 0 and each `plan_interval` after it; the
+            first is left out, because the log has no joints before it.
+
+    Raises:
+        InputError: the walk is shorter than two plans.
+    """
+    per_tick = round(config.gait.tick / float(walk.period))
+    every = per_tick * config.twin.plan_ticks
+    rows = np.arange(every, int(np.sum(~walk.fallen)), every)
+    if not len(rows):
+        raise InputError(f"a walk of at least two plans of {config.plan_interval:g} s is needed")
+    before = jax.tree.map(lambda x: x[rows - 1], (walk.state, walk.joints))
+    planned = _plans(config, robot, weights, command, (walk.initial, *before, rows // per_tick))
+    wrench, contact, residual = jax.tree.map(np.asarray, planned)
+    logged, twin = (
+        np.concatenate(x, axis=-1) * contact[..., None]
+        for x in (jax.tree.map(lambda x: x[rows], walk.command), wrench)
+    )
+    stands = walk.contact[rows]
+    other = np.mean(np.any(stands != contact, axis=1)) if walk.contact.any() else 0.0
+    times = rows * float(walk.period)
+    return Parity(times, logged, twin, float(other), int(np.sum(~(residual <= SOLVED))))
+
+
+@partial(jax.jit, static_argnums=0)
+def _plans(
+    config: WalkConfig, robot: Robot, weights: Weights, command: Command, walk: tuple
+) -> tuple[Wrench, Array, Array]:
+    """Return wrenches, stance feet and residuals of the plans."""
+    initial, *plans = walk
+    anchor, parameters = anchor_at(robot, initial, 0), config.parameters(weights)
+
+    def one(disturbance: Disturbance, inputs: tuple) -> tuple[Disturbance, tuple]:
+        state, joints, tick = inputs
+        feet = measured_feet(robot, Measurement(state, joints, jnp.zeros_like(joints)))
+        planned, disturbance = plan(
+            config,
+            robot,
+            parameters,
+            command=command,
+            anchor=anchor,
+            tick=tick,
+            state=state,
+            feet=feet,
+            disturbance=disturbance,
+            max_contacts=contacts_needed(config, 0),
+        )
+        return disturbance, (planned.wrench, planned.contact, planned.residual)
+
+    _, planned = jax.lax.scan(one, NO_DISTURBANCE, tuple(plans))
+    return planned

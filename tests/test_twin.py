@@ -1,0 +1,181 @@
+"""The MPC of another controller: its parts, and parity of its plans with those of the example."""
+
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from model import AHEAD, PLAIN, ROBOT
+from pretend import call
+
+from hector_jax.control.contact import BOX_FRICTION, TWIST, Constraint
+from hector_jax.control.controller import WalkConfig, plan, plan_horizon, walk_config
+from hector_jax.control.footstep import Feet
+from hector_jax.control.mpc import MpcConfig
+from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.twin import FROM_ROBOT, FROZEN, PATH, ReferenceInputs, TwinConfig
+from hector_jax.control.weights import expert
+from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import State
+from hector_jax.robot.model import load_robot
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
+
+OWN = Path(__file__).parents[1] / "examples" / "own_controller"
+ANCHOR = standing_anchor(ROBOT)
+HEIGHT = float(ROBOT.standing_height)
+STATE = State(*(jnp.array(x) for x in ([0.05, 0.1, 0.3], [1.0, 2.0, 0.5], [0.1] * 3, [0.4, 0, 0])))
+FEET = Feet(STATE.position + jnp.array([[0.1, 0.08, -0.5], [-0.1, -0.08, -0.45]]), jnp.full(2, 0.2))
+
+
+@partial(jax.jit, static_argnums=0)
+def horizon(config, tick=5):
+    now = {"tick": jnp.asarray(tick), "state": STATE, "feet": FEET}
+    parameters = config.footstep.parameters
+    inputs = {"command": named_command("s"), "anchor": ANCHOR, **now}
+    return plan_horizon(config, ROBOT, parameters, **inputs)[0]
+
+
+@partial(jax.jit, static_argnums=0)
+def planned(config, tick=5, last=None):
+    both = 2 if config.twin.air_moments else 1
+    return plan(
+        config,
+        ROBOT,
+        config.parameters(expert()),
+        command=named_command("s"),
+        anchor=ANCHOR,
+        tick=jnp.asarray(tick),
+        state=STATE,
+        feet=FEET,
+        last=last,
+        max_contacts=both,
+    )[0]
+
+
+def twin(**changes):
+    return WalkConfig(twin=TwinConfig(**changes))
+
+
+def test_a_reference_from_the_robot_starts_at_it_and_goes_on_with_the_command():
+    motion = ReferenceInputs(named_command("c"), ANCHOR, jnp.arange(0, 33, 3), STATE)
+    ahead = FROM_ROBOT.of(0.01, motion)
+    np.testing.assert_allclose(ahead.position[0], [1.0, 2.0, HEIGHT], atol=1e-15)
+    np.testing.assert_allclose(ahead.euler[:, 2], 0.3 + 0.03 * np.pi / 4 * np.arange(11))
+    steps = np.diff(ahead.position, axis=0) / 0.03
+    np.testing.assert_allclose(steps, ahead.velocity[:-1], atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(ahead.velocity, axis=1), 0.25)
+    # the path, which does not know the robot, has the same rates and lengths of the steps
+    path = PATH.of(0.01, motion)
+    np.testing.assert_allclose(path.ang_velocity, ahead.ang_velocity)
+    np.testing.assert_allclose(path.position[0], [*ROBOT.com_offset[:2], HEIGHT], atol=1e-12)
+
+
+def test_the_target_of_a_late_step_is_that_of_the_step_before():
+    on_time, late = (horizon(twin(late=late)).reference for late in (0, 1))
+    for now, then in zip(on_time, late, strict=True):
+        np.testing.assert_array_equal(then[1:], now[:-1])
+
+
+def test_a_frozen_linearisation_is_that_of_the_present_in_all_steps():
+    found = horizon(twin(linearisation=FROZEN))
+    np.testing.assert_allclose(found.euler, np.tile(STATE.euler, (10, 1)))
+    np.testing.assert_allclose(found.lever, np.tile(FEET.position - STATE.position, (10, 1, 1)))
+    np.testing.assert_allclose(found.foot_yaw, 0.2)
+
+
+def test_contacts_are_those_at_the_share_of_a_step_that_is_asked_for():
+    # steps of 3 ticks from tick 18 on; the feet change at 20 and at 40, within the step from 39 on
+    begin, middle = (horizon(twin(contact_at=x), 18).contact[:, 0] for x in (0.0, 0.5))
+    np.testing.assert_array_equal(np.flatnonzero(begin != middle), [7])
+
+
+def test_between_plans_of_several_ticks_the_wrench_of_the_last_one_is_kept():
+    robot = ROBOT._replace(description=ROBOT.description)
+    config = RolloutConfig(walk=replace(WalkConfig(), twin=TwinConfig(plan_ticks=2)), ticks=12)
+    walk = jax.jit(partial(rollout, config))(Scenario(robot, AHEAD, ANCHOR, PLAIN), expert())
+    forces = np.asarray(walk.command.force)
+    np.testing.assert_array_equal(forces[1::2], forces[::2])
+    assert (np.diff(forces[::2], axis=0) != 0).any(axis=(1, 2)).all()
+    assert (np.asarray(walk.residual)[1::2] == 0.0).all()
+
+
+def test_a_foot_in_the_air_with_inputs_changes_the_plan_and_exerts_nothing():
+    # of the rows of a line foot one also makes the yaw moment zero without a force
+    walk = WalkConfig(mpc=MpcConfig(line_friction=False))
+    without, found = planned(walk), planned(replace(walk, twin=TwinConfig(air_moments=True)))
+    air = ~np.asarray(found.contact)
+    assert air.sum() == 1
+    assert np.abs(np.asarray(found.wrench.moment)[air]).max() == 0.0
+    assert np.abs(np.asarray(found.wrench.moment - without.wrench.moment)).max() > 1e-3
+    assert found.residual < 1e-9
+
+
+def test_the_body_of_a_twin_is_planned_with():
+    given = {"mass": 2.0 * float(ROBOT.mass), "inertia": (1.0, 2.0, 3.0), "toe": 0.01, "heel": 0.02}
+    body = TwinConfig(**given).body(ROBOT)
+    np.testing.assert_array_equal(body.inertia, np.diag([1.0, 2.0, 3.0]))
+    assert (body.mass, body.toe, body.heel) == (given["mass"], 0.01, 0.02)
+    configs = twin(reference=FROM_ROBOT, mass=given["mass"]), twin(reference=FROM_ROBOT)
+    heavy, own = (float(planned(config).wrench.force[0, 2]) for config in configs)
+    assert heavy > 1.2 * own
+    with pytest.raises(InputError, match="TwinConfig.inertia must be 3 numbers"):
+        TwinConfig(inertia=(1.0,))
+
+
+def test_friction_as_a_box_and_a_limited_twist_hold_along_the_foot():
+    names = ("box_friction", "unilateral_force", "line_pressure", "twist")
+    known = {str(one): one for one in Constraint.known}
+    constraints = tuple(known[name] for name in names)
+    assert {BOX_FRICTION, TWIST} <= {*constraints}
+    config = replace(twin(), mpc=MpcConfig(constraints=constraints, friction=0.05, twist=0.002))
+    wrench = planned(config).wrench
+    c, s = np.cos(0.2), np.sin(0.2)
+    (fx, fy, fz), mz = np.asarray(wrench.force[0]), float(wrench.moment[0, 2])
+    along, across = c * fx + s * fy, c * fy - s * fx
+    assert max(abs(along), abs(across)) <= 0.05 * fz + 1e-9
+    assert max(abs(along), abs(across)) == pytest.approx(0.05 * fz)  # it is active
+    assert abs(mz) == pytest.approx(0.002 * fz)
+
+
+@pytest.fixture(scope="module")
+def walked(tmp_path_factory):
+    """The log of the example, and the line of a command about it."""
+    pytest.importorskip("daqp")
+    path = tmp_path_factory.mktemp("own") / "log.npz"
+    line = ("--traj", "s", "--seconds", 1.5, "--weights", "expert")
+    with pytest.MonkeyPatch.context() as patch:
+        walker = ("walk", "--walker", OWN / "walker.py", *line, "--out", path)
+        assert call(patch, *walker, "--robot", OWN / "twin.toml") == 0
+    return path, ("twin", path, *line, "--robot")
+
+
+def test_the_plans_of_the_example_are_those_of_its_twin(walked, monkeypatch, capsys):
+    path, line = walked
+    assert call(monkeypatch, *line, OWN / "twin.toml", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["plans"] == 149
+    assert found["unsolved"] == found["other_contact"] == 0
+    assert max(found[name]["worst"] for name in ("F_x", "F_y", "F_z", "M_x", "M_y", "M_z")) < 1e-6
+
+
+def test_a_twin_of_another_kind_is_told_where_it_differs(walked, tmp_path, monkeypatch, capsys):
+    path, line = walked
+    (tmp_path / "hector.xml").write_bytes((OWN / "hector.xml").read_bytes())
+    text = (OWN / "twin.toml").read_text().replace("cycles = 1", "cycles = 2")
+    text = text.replace("stance = 40\nswing = 40", "stance = 44\nswing = 36")
+    (tmp_path / "other.toml").write_text(text.replace("friction = 0.5", "friction = 0.4"))
+    assert call(monkeypatch, *line, tmp_path / "other.toml") == 0
+    text = capsys.readouterr().out
+    assert "149 plans" in text
+    assert "% of the plans the log has other feet on the floor: see [gait]" in text
+    assert " foot, F_" in text
+
+
+def test_a_twin_file_is_read_as_a_robots():
+    config = walk_config(load_robot(OWN / "twin.toml"))
+    assert config.twin == TwinConfig(FROM_ROBOT, 0, FROZEN, contact_at=0.0, plan_ticks=2)
+    assert config.plan_interval == pytest.approx(0.01)
