@@ -22,7 +22,7 @@ from hector_jax.control.weights import expert
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State
 from hector_jax.robot.model import load_robot
-from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout, rollout_config
 
 OWN = Path(__file__).parents[1] / "examples" / "own_controller"
 ANCHOR = standing_anchor(ROBOT)
@@ -179,3 +179,4 @@ def test_a_twin_file_is_read_as_a_robots():
     config = walk_config(load_robot(OWN / "twin.toml"))
     assert config.twin == TwinConfig(FROM_ROBOT, 0, FROZEN, contact_at=0.0, plan_ticks=2)
     assert config.plan_interval == pytest.approx(0.01)
+    assert rollout_config(load_robot(OWN / "twin.toml")).ticks == 800  # 4 s

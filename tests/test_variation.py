@@ -148,7 +148,7 @@ def test_the_description_of_a_robot_states_the_noise_and_the_delay_of_its_tuning
 
 
 def test_a_tuning_sees_the_noise_and_the_delay_of_the_description():
-    config = rollout_config(robot_with(estimate_noise=1.0, delay=0.005), ticks=10)
+    config = rollout_config(robot_with(estimate_noise=1.0, delay=0.005), seconds=0.1)
     without = RolloutConfig(ticks=10)
     seen = tune_step(TuneConfig(rollout=config), SCENARIO, nominal())
     told, none = with_variation(config, SCENARIO), SCENARIO._replace(variation=BELIEVED)

@@ -53,12 +53,15 @@ def run_twin(args: Twin) -> None:
     walk, _ = read_walk(args.log, robot, seconds, config.gait.tick)
     weights = arguments.weights_by_name(args.weights, robot)
     parity = compare_plans(config, robot, weights, trajectory.command, walk)
-    plan, foot, axis = parity.worst
-    at_worst = {"at": parity.time[plan], "foot": int(foot), "component": COMPONENTS[axis]}
-    at_worst |= {"logged": parity.logged[tuple(parity.worst)]}
-    at_worst |= {"twin": parity.twin[tuple(parity.worst)]}
+    row, axis = parity.worst
+    at_worst = {
+        "at": parity.time[row],
+        "foot": int(parity.foot[row]),
+        "component": COMPONENTS[axis],
+    }
+    at_worst |= {"logged": parity.logged[row, axis], "twin": parity.twin[row, axis]}
     result = {
-        "plans": len(parity.time),
+        "plans": parity.plans,
         **{name: _quantiles(parity, i) for i, name in enumerate(COMPONENTS)},
         "worst": at_worst,
         "other_contact": parity.other_contact,
@@ -68,23 +71,22 @@ def run_twin(args: Twin) -> None:
 
 
 def _quantiles(parity: Parity, component: int) -> dict[str, float]:
-    distance = parity.distance[:, :, component]
+    distance = parity.distance[:, component]
     names, shares = ("median", "99 %", "worst"), (0.5, 0.99, 1.0)
     return {n: float(np.quantile(distance, q)) for n, q in zip(names, shares, strict=True)}
 
 
 def _parity_lines(parity: Parity, robot: Robot) -> Iterator[str]:
     """Return the lines that `hector twin` prints."""
-    yield f"{plural(len(parity.time), 'plan')}; differences in N and N m, world frame"
+    yield f"{plural(parity.plans, 'plan')}; differences in N and N m, world frame"
     yield f"{'':5}{'median':>10}{'99 %':>10}{'worst':>10}"
     for i, name in enumerate(COMPONENTS):
         yield f"{name:5}" + "".join(f"{x:10.2g}" for x in _quantiles(parity, i).values())
-    plan, foot, axis = parity.worst
-    logged, twin = (x[tuple(parity.worst)] for x in (parity.logged, parity.twin))
-    side = FEET[len(robot.foot_point)][foot].replace("_", " ")
+    row, axis = parity.worst
+    side = FEET[len(robot.foot_point)][parity.foot[row]].replace("_", " ")
     yield (
-        f"most at {parity.time[plan]:.3f} s, {side} foot, {COMPONENTS[axis]}: {logged:.6g} in the "
-        f"log, {twin:.6g} of the twin"
+        f"most at {parity.time[row]:.3f} s, {side} foot, {COMPONENTS[axis]}: "
+        f"{parity.logged[row, axis]:.6g} in the log, {parity.twin[row, axis]:.6g} of the twin"
     )
     if parity.other_contact:
         share = 100 * parity.other_contact

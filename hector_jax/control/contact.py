@@ -80,14 +80,32 @@ class ContactModel(Part):
         """Matrix from the inputs to the six wrench components."""
         return np.eye(6)[:, list(self.components)]
 
-    def wrench(self, yaw: Float[Array, ""]) -> tuple[Array, Array]:
-        """Return the matrices (3, inputs) from a foot's inputs to force and moment, world frame."""
+    def wrench(
+        self, yaw: Float[Array, ""], frame: Float[Array, "3 3"] | None = None
+    ) -> tuple[Array, Array]:
+        """Return the matrices (3, inputs) from a foot's inputs to force and moment, world frame.
+
+        Moments of the inputs are in the foot's yaw frame, or in a `frame` that is given.
+        """
         selection = jnp.asarray(self.selection, jnp.result_type(yaw))
-        return selection[:3], contract("xy,yi->xi", rot_z(yaw), selection[3:])
+        turn = rot_z(yaw) if frame is None else frame
+        return selection[:3], contract("xy,yi->xi", turn, selection[3:])
+
+    def in_frame(
+        self, yaw: Float[Array, ""], frame: Float[Array, "3 3"] | None
+    ) -> tuple[Array, Array, Array]:
+        """Return force, moment and yaw of a `Contact`."""
+        selection = jnp.asarray(self.selection, jnp.result_type(yaw))
+        if frame is None:
+            return selection[:3], selection[3:], yaw
+        return contract("yx,yi->xi", frame, selection[:3]), selection[3:], jnp.zeros_like(yaw)
 
 
 class Contact(NamedTuple):
-    """Arguments of a constraint or cost on a stance foot: matrices from inputs to wrench."""
+    """Arguments of a constraint or cost on a stance foot: matrices from inputs to wrench.
+
+    In the frame of the trunk, if a twin asks for it, both matrices are in it and the yaw is zero.
+    """
 
     force: Float[Array, "3 inputs"]  # in the world [N]
     moment: Float[Array, "3 inputs"]  # in the foot's yaw frame [N m]

@@ -151,6 +151,7 @@ def plan_horizon(
     tick: Int[Array, ""],
     state: State,
     feet: Feet,
+    desired: State | None = None,
 ) -> tuple[Horizon, Feet]:
     """Return the horizon of the MPC and the next touchdown of each foot.
 
@@ -160,17 +161,19 @@ def plan_horizon(
         tick: current gait tick.
         state: current base state.
         feet: current foot points; those of feet in the air are not used.
+        desired: pose at the start of the reference; None: by the rule of the twin.
 
     Source: Eq. 6, 14-16.
     """
     ticks, twin = config.gait, config.twin
     steps = tick + config.mpc.step_ticks * jnp.arange(config.mpc.horizon + 1)
     reference = twin.reference.of(ticks.tick, ReferenceInputs(command, anchor, steps, state))
+    reference = twin.target(reference, desired)
     current = jax.tree.map(lambda r: r[0], reference)
 
+    shift = int(twin.contact_at * config.mpc.step_ticks)
     # step 0 takes the current contact
-    inside = steps[1:-1] + int(twin.contact_at * config.mpc.step_ticks)
-    times = jnp.concatenate([tick[None], inside])
+    times = jnp.concatenate([steps[:1] + min(shift, 0), steps[1:-1] + shift])
     count = gait.touchdowns(ticks, tick, times)
     wait = gait.ticks_to_touchdown(ticks, tick)
     lengths = {"stance": ticks.tick * ticks.stance, "swing": ticks.tick * ticks.swing}
@@ -191,6 +194,7 @@ def plan_horizon(
         *twin.linearisation.of(state, feet, reference, Feet(points, yaw)),
         contact=contact,
         inputs=jnp.ones_like(contact) if twin.air_moments else None,
+        frame=rotation_from_euler(state.euler) if twin.frame == "trunk" else None,
     )
     return horizon, touchdowns[0]
 
@@ -227,6 +231,7 @@ def plan(
     feet: Feet,
     disturbance: Disturbance = NO_DISTURBANCE,
     last: Wrench | None = None,
+    desired: State | None = None,
     max_contacts: int = 1,
 ) -> tuple[Plan, Disturbance]:
     """Solve the MPC for one tick.
@@ -239,6 +244,7 @@ def plan(
         feet: current foot points; those of feet in the air are not used.
         disturbance: from the previous plan.
         last: wrench of the previous plan, which is kept between plans of several ticks; None: plan.
+        desired: pose at the start of the reference of a log; None: by the rule of the twin.
         max_contacts: from `contacts_needed` (static).
 
     Returns:
@@ -246,6 +252,7 @@ def plan(
 
     Source: Eq. 3-6.
     """
+    state = config.twin.state(robot, state)
     horizon, touchdown = plan_horizon(
         config,
         robot,
@@ -255,6 +262,7 @@ def plan(
         tick=tick,
         state=state,
         feet=feet,
+        desired=desired,
     )
     dt, every = config.gait.tick, config.twin.plan_ticks
     reference = reference_at(dt, command, anchor, tick)

@@ -7,7 +7,7 @@ term).
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from hector_jax.core.arrays import Array, contract
 from hector_jax.core.geometry import rot_z
-from hector_jax.core.settings import NOT_NEGATIVE, check
+from hector_jax.core.settings import NOT_NEGATIVE, SHARE, check
 from hector_jax.core.trajectory import State
 from hector_jax.robot.model import Robot
 
@@ -49,6 +49,8 @@ class FootstepConfig:
     width: float = 0.08  # [m] lateral distance of each foot from the middle
     feedback: float = 0.12  # [s] k_v, on the velocity error
     turn: float = 0.5  # share of the lean (z/g) v x omega
+    travel: Annotated[float, SHARE] = 1.0  # share that counts of the way until touchdown
+    ahead: Annotated[float, SHARE] = 0.5  # share of a stance that the body travels past a foot
 
     def __post_init__(self) -> None:
         check(self, rule=("raibert", "paper"), width=NOT_NEGATIVE)
@@ -103,8 +105,8 @@ def touchdown_points(
     points = (
         state.position
         + hips
-        + travel
-        + stance / 2 * state.velocity
+        + config.travel * travel
+        + config.ahead * stance * state.velocity
         + parameters.feedback * (state.velocity - reference.velocity)
         + parameters.turn * lean
     )

@@ -128,6 +128,7 @@ class Horizon(NamedTuple):
     foot_yaw: Float[Array, "N feet"]  # [rad]
     contact: Bool[Array, "N feet"]
     inputs: Bool[Array, "N feet"] | None = None  # feet that have inputs; None: those in contact
+    frame: Float[Array, "3 3"] | None = None  # of all constraints and moments; None: yaw of feet
 
 
 class MpcProblem(NamedTuple):
@@ -174,10 +175,10 @@ def _double_integrator(N: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _input_map(
-    model: ContactModel, feet: Float[Array, "contacts feet"], foot_yaw: Float[Array, " feet"]
+    model: ContactModel, horizon: Horizon, feet: Float[Array, "contacts feet"], foot_yaw: Array
 ) -> Float[Array, "u b"]:
     """Return G in u = G v, from the inputs of the contacts to the paper's u."""
-    force, moment = jax.vmap(model.wrench)(foot_yaw)  # (feet, 3, inputs)
+    force, moment = jax.vmap(lambda yaw: model.wrench(yaw, horizon.frame))(foot_yaw)
     parts = [contract("sf,fxi->fxsi", feet, part) for part in (force, moment)]
     return jnp.stack(parts).reshape(6 * len(foot_yaw), -1)
 
@@ -191,7 +192,7 @@ def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: in
     A, B = jax.vmap(lambda e, r: srbm.linearise(robot, e, r, dt))(horizon.euler, horizon.lever)
     inputs = horizon.contact if horizon.inputs is None else horizon.inputs
     feet = jax.vmap(lambda c: feet_of_contacts(c.astype(dtype), max_contacts))(inputs)
-    G = jax.vmap(partial(_input_map, config.contact))(feet, horizon.foot_yaw)
+    G = jax.vmap(partial(_input_map, config.contact, horizon))(feet, horizon.foot_yaw)
     # inputs change rates and velocities, which persist; angles and positions integrate them
     changes = B[:, 6:9], B[:, 9:12]
     turn, push = (contract("kxu,kub->kxb", change, G) for change in changes)
@@ -288,12 +289,11 @@ def _on_contacts(
 ) -> tuple[Array, ...]:
     """Return rows of parts on inputs, block-diagonal by step (N, rows, b), and their numbers."""
     feet, (robot, parameters, _, horizon, _) = condensed.feet, problem
-    select = jnp.asarray(config.contact.selection, feet.dtype)
     robot = robot._replace(half_width=config.sole_width * robot.half_width)
 
     def of_contact(yaw: Float[Array, ""], max_force: Float[Array, ""]) -> tuple[Array, ...]:
-        limits = parameters.friction, max_force, config.twist
-        contact = Contact(select[:3], select[3:], yaw, robot, *limits)
+        framed = config.contact.in_frame(yaw, horizon.frame)
+        contact = Contact(*framed, robot, parameters.friction, max_force, config.twist)
         each = [rows(part, contact, feet) for part in parts]
         return tuple(map(jnp.concatenate, zip(*each, strict=True)))
 

@@ -18,10 +18,10 @@ from jaxtyping import Float, Int
 from hector_jax.control.footstep import Feet
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.core.arrays import Array, contract
-from hector_jax.core.geometry import rot_z
+from hector_jax.core.geometry import rot_z, rotation_from_euler, wrap_angle
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.part import Part
-from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SHARE, check
+from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, Range, check
 from hector_jax.core.trajectory import State
 from hector_jax.robot.model import Robot
 
@@ -62,13 +62,31 @@ def _from_robot(tick_length: float, inputs: ReferenceInputs) -> State:
     )
 
 
+def _trunk_velocity(tick_length: float, inputs: ReferenceInputs) -> State:
+    command, anchor, ticks, state = inputs
+    now = reference_at(tick_length, command, anchor, ticks[0])
+    elapsed = tick_length * (ticks - ticks[0])[:, None]
+    wanted = contract("xy,y->x", rot_z(-now.euler[2]), now.velocity)
+    velocity = contract("xy,y->x", rotation_from_euler(state.euler), wanted)
+    start = jnp.stack([state.position[0], state.position[1], now.position[2]])
+    return State(
+        euler=jnp.array([0.0, 0.0, 1.0]) * (state.euler[2] + elapsed * now.ang_velocity[2]),
+        position=start + elapsed * velocity * jnp.array([1.0, 1.0, 0.0]),
+        ang_velocity=jnp.broadcast_to(now.ang_velocity, (len(ticks), 3)),
+        velocity=jnp.broadcast_to(velocity, (len(ticks), 3)),
+    )
+
+
 PATH = ReferenceRule("path", of=_path)
 """The commanded path, whatever the robot does."""
 
 FROM_ROBOT = ReferenceRule("from_robot", of=_from_robot)
 """From x, y and yaw of the robot on with the present command; height as commanded."""
 
-ReferenceRule.known = (PATH, FROM_ROBOT)
+TRUNK_VELOCITY = ReferenceRule("trunk_velocity", of=_trunk_velocity)
+"""From x, y and yaw of the robot on straight ahead, with the command in the trunk's frame."""
+
+ReferenceRule.known = (PATH, FROM_ROBOT, TRUNK_VELOCITY)
 
 
 class Around(NamedTuple):
@@ -119,22 +137,47 @@ class TwinConfig:
     reference: ReferenceRule = PATH
     late: Annotated[int, NOT_NEGATIVE] = 0  # steps by which the target of a step is that before it
     linearisation: Linearisation = ALONG_REFERENCE
-    contact_at: Annotated[float, SHARE] = 0.5  # share of a step at which its contacts are read
+    # share of a step at which its contacts are read; below 0: before it, and the present ones too
+    contact_at: Annotated[float, Range(-1.0, 1.0)] = 0.5
     plan_ticks: Annotated[int, AT_LEAST_ONE] = 1  # gait ticks from plan to plan
     air_moments: bool = False  # feet in the air have inputs too; constraints make their force zero
-    mass: float | None = None  # [kg]; None: the robot's, as for what follows
+    frame: str = "foot"  # of moments and constraints: each foot's yaw, or "trunk", its attitude
+    com: tuple[float, ...] | None = None  # [m] in the trunk's frame; None: the robot's, as below
+    height: float | None = None  # [m] of this point in the reference
+    mass: float | None = None  # [kg]
     inertia: tuple[float, ...] | None = None  # [kg m^2] about the trunk's x, y and z
     toe: float | None = None  # [m] ahead of the foot point; heel behind it
     heel: float | None = None
 
     def __post_init__(self) -> None:
-        check(self, mass=POSITIVE, inertia=POSITIVE, toe=NOT_NEGATIVE, heel=NOT_NEGATIVE)
-        if self.inertia is not None and len(self.inertia) != 3:
-            got = short_repr(self.inertia)
-            raise InputError(f"TwinConfig.inertia must be 3 numbers, got {got}")
+        positive = dict.fromkeys(("height", "mass", "inertia"), POSITIVE)
+        check(self, toe=NOT_NEGATIVE, heel=NOT_NEGATIVE, frame=("foot", "trunk"), **positive)
+        for name in ("com", "inertia"):
+            if (got := getattr(self, name)) is not None and len(got) != 3:
+                text = f"TwinConfig.{name} must be 3 numbers"
+                raise InputError(f"{text}, got {short_repr(got)}")
 
     def body(self, robot: Robot) -> Robot:
         """Return the robot as the MPC takes it to be."""
         given = {name: getattr(self, name) for name in ("mass", "toe", "heel")}
         given["inertia"] = None if self.inertia is None else np.diag(self.inertia)
         return robot._replace(**{name: x for name, x in given.items() if x is not None})
+
+    def state(self, robot: Robot, state: State) -> State:
+        """Return the state of the point that the MPC takes for the centre of mass."""
+        if self.com is None:
+            return state
+        shift = np.array(self.com) - robot.com_offset
+        offset = contract("xy,y->x", rotation_from_euler(state.euler), shift)
+        velocity = state.velocity + jnp.cross(state.ang_velocity, offset)
+        return state._replace(position=state.position + offset, velocity=velocity)
+
+    def target(self, reference: State, desired: State | None) -> State:
+        """Return the reference at its height, or from a desired pose on, which a log may have."""
+        position, euler = reference.position, reference.euler
+        if self.height is not None:
+            position = position.at[:, 2].set(self.height)
+        if desired is not None:
+            position = position + desired.position - position[0]
+            euler = euler + wrap_angle(desired.euler - euler[0])
+        return reference._replace(position=position, euler=euler)

@@ -27,21 +27,24 @@ COMPONENTS = ("F_x", "F_y", "F_z", "M_x", "M_y", "M_z")
 class Parity(NamedTuple):
     """Plans of a log and of the twin; world frame."""
 
-    time: Float[np.ndarray, " plans"]  # [s]
-    logged: Float[np.ndarray, "plans feet 6"]  # wrenches [N, N m] of the feet that stand
-    twin: Float[np.ndarray, "plans feet 6"]
+    time: Float[np.ndarray, " rows"]  # [s] of each plan and foot that stands
+    foot: Int[np.ndarray, " rows"]
+    logged: Float[np.ndarray, "rows 6"]  # wrenches [N, N m]
+    twin: Float[np.ndarray, "rows 6"]
+    plans: int
     other_contact: float  # share of the plans in which other feet stand
     unsolved: int  # plans of the twin
 
     @property
-    def distance(self) -> Float[np.ndarray, "plans feet 6"]:
+    def distance(self) -> Float[np.ndarray, "rows 6"]:
         """Absolute differences [N, N m]."""
         return np.abs(self.logged - self.twin)
 
     @property
-    def worst(self) -> Int[np.ndarray, "3"]:
-        """Plan, foot and component of the largest difference."""
-        return np.array(np.unravel_index(np.argmax(self.distance), self.distance.shape))
+    def worst(self) -> tuple[int, int]:
+        """Row and component of the largest difference."""
+        row, component = divmod(int(np.argmax(self.distance)), len(COMPONENTS))
+        return row, component
 
 
 def compare_plans(
@@ -53,7 +56,8 @@ def compare_plans(
         config, robot: of the twin.
         weights, command: with which the controller walked.
         walk: as `read_walk` returns it. A plan is at t = 0 and each `plan_interval` after it; the
-            first is left out, because the log has no joints before it.
+            first is left out, because the log has no joints before it. If it has a reference, that
+            of each plan starts there.
 
     Raises:
         InputError: the walk is shorter than two plans.
@@ -63,17 +67,21 @@ def compare_plans(
     rows = np.arange(every, int(np.sum(~walk.fallen)), every)
     if not len(rows):
         raise InputError(f"a walk of at least two plans of {config.plan_interval:g} s is needed")
-    before = jax.tree.map(lambda x: x[rows - 1], (walk.state, walk.joints))
+    own = walk.reference if walk.reference.position.any() else None  # the log has one
+    before = walk.state, walk.joints, own
+    before = jax.tree.map(lambda x: x[rows - 1], before)
     planned = _plans(config, robot, weights, command, (walk.initial, *before, rows // per_tick))
     wrench, contact, residual = jax.tree.map(np.asarray, planned)
+    plan, foot = np.nonzero(contact)
     logged, twin = (
-        np.concatenate(x, axis=-1) * contact[..., None]
+        np.concatenate(x, axis=-1)[plan, foot]
         for x in (jax.tree.map(lambda x: x[rows], walk.command), wrench)
     )
     stands = walk.contact[rows]
     other = np.mean(np.any(stands != contact, axis=1)) if walk.contact.any() else 0.0
-    times = rows * float(walk.period)
-    return Parity(times, logged, twin, float(other), int(np.sum(~(residual <= SOLVED))))
+    unsolved = int(np.sum(~(residual <= SOLVED)))
+    time = rows[plan] * float(walk.period)
+    return Parity(time, foot, logged, twin, len(rows), float(other), unsolved)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -85,7 +93,7 @@ def _plans(
     anchor, parameters = anchor_at(robot, initial, 0), config.parameters(weights)
 
     def one(disturbance: Disturbance, inputs: tuple) -> tuple[Disturbance, tuple]:
-        state, joints, tick = inputs
+        state, joints, desired, tick = inputs
         feet = measured_feet(robot, Measurement(state, joints, jnp.zeros_like(joints)))
         planned, disturbance = plan(
             config,
@@ -97,6 +105,7 @@ def _plans(
             state=state,
             feet=feet,
             disturbance=disturbance,
+            desired=desired,
             max_contacts=contacts_needed(config, 0),
         )
         return disturbance, (planned.wrench, planned.contact, planned.residual)

@@ -60,8 +60,8 @@ class RolloutConfig:
             )
 
 
-def rollout_config(robot: Robot, ticks: int = RolloutConfig.ticks) -> RolloutConfig:
-    """Return the settings of a rollout from a robot's description.
+def rollout_config(robot: Robot, seconds: float = 4.0) -> RolloutConfig:
+    """Return the settings of a rollout of this length [s] from a robot's description.
 
     Raises:
         InputError: one line naming the file, the key and what was expected.
@@ -69,7 +69,7 @@ def rollout_config(robot: Robot, ticks: int = RolloutConfig.ticks) -> RolloutCon
     walk, tuning = walk_config(robot), robot.description.tuning
     settings = {name: getattr(tuning, name) for name in ("lead", "estimate_noise", "delay")}
     try:
-        return RolloutConfig(walk=walk, ticks=ticks, **settings)
+        return RolloutConfig(walk=walk, ticks=round(seconds / walk.gait.tick), **settings)
     except InputError as error:
         raise InputError(f"{robot.description.path}: tuning: {error}") from None
 

@@ -71,7 +71,7 @@ def walk_jobs(
 
 def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: float) -> Trajectory:
     """Return a walk of `seconds` on the plain rigid body, without a tuning's noise and delay."""
-    config = rollout_config(robot, round(seconds / walk_config(robot).gait.tick))
+    config = rollout_config(robot, seconds)
     config = replace(config, estimate_noise=0.0, delay=0.0)
     scenario = Scenario(robot, command, standing_anchor(robot), last_command)
     return jax.device_get(jax.jit(rollout, static_argnums=0)(config, scenario, weights))
