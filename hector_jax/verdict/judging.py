@@ -9,7 +9,6 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import Command, standing_anchor
 from hector_jax.control.weights import Weights
 from hector_jax.core.console import bar, say
