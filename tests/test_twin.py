@@ -74,6 +74,18 @@ def test_a_reference_from_the_robot_starts_at_it_and_goes_on_with_the_command():
     np.testing.assert_allclose(path.position[0], [*ROBOT.com_offset[:2], HEIGHT], atol=1e-12)
 
 
+def test_what_the_command_leaves_at_rest_keeps_to_the_path():
+    path, robot, both = (
+        horizon(twin(**changes)).reference
+        for changes in ({}, {"reference": FROM_ROBOT}, {"reference": FROM_ROBOT, "at_rest": 0.2})
+    )
+    assert abs(path.velocity[0, 1]) < 0.2 < path.velocity[0, 0]  # ahead along x
+    np.testing.assert_allclose(both.position[:, 0], robot.position[:, 0])
+    step = both.position[:, 1] - robot.position[:, 1]
+    np.testing.assert_allclose(step, step[0])
+    assert abs(both.position[0, 1] - path.position[0, 1]) < 0.01
+
+
 def test_the_target_of_a_late_step_is_that_of_the_step_before():
     on_time, late = (horizon(twin(late=late)).reference for late in (0, 1))
     for now, then in zip(on_time, late, strict=True):
@@ -177,6 +189,6 @@ def test_a_twin_of_another_kind_is_told_where_it_differs(walked, tmp_path, monke
 
 def test_a_twin_file_is_read_as_a_robots():
     config = walk_config(load_robot(OWN / "twin.toml"))
-    assert config.twin == TwinConfig(FROM_ROBOT, 0, FROZEN, contact_at=0.0, plan_ticks=2)
+    assert config.twin == TwinConfig(FROM_ROBOT, linearisation=FROZEN, contact_at=0.0, plan_ticks=2)
     assert config.plan_interval == pytest.approx(0.01)
     assert rollout_config(load_robot(OWN / "twin.toml")).ticks == 800  # 4 s

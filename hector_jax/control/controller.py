@@ -168,7 +168,7 @@ def plan_horizon(
     ticks, twin = config.gait, config.twin
     steps = tick + config.mpc.step_ticks * jnp.arange(config.mpc.horizon + 1)
     reference = twin.reference.of(ticks.tick, ReferenceInputs(command, anchor, steps, state))
-    reference = twin.target(reference, desired)
+    reference = twin.target(reference, reference_at(ticks.tick, command, anchor, tick), desired)
     current = jax.tree.map(lambda r: r[0], reference)
 
     shift = int(twin.contact_at * config.mpc.step_ticks)

@@ -135,6 +135,8 @@ class TwinConfig:
     """How the MPC predicts and how often it plans; the defaults are those of this project."""
 
     reference: ReferenceRule = PATH
+    # [m/s], [rad/s] x, y and yaw whose command is slower are those of the path
+    at_rest: Annotated[float, NOT_NEGATIVE] = 0.0
     late: Annotated[int, NOT_NEGATIVE] = 0  # steps by which the target of a step is that before it
     linearisation: Linearisation = ALONG_REFERENCE
     # share of a step at which its contacts are read; below 0: before it, and the present ones too
@@ -172,9 +174,20 @@ class TwinConfig:
         velocity = state.velocity + jnp.cross(state.ang_velocity, offset)
         return state._replace(position=state.position + offset, velocity=velocity)
 
-    def target(self, reference: State, desired: State | None) -> State:
-        """Return the reference at its height, or from a desired pose on, which a log may have."""
+    def target(self, reference: State, path: State, desired: State | None) -> State:
+        """Return the reference at its height, and from the poses on that are not by its rule.
+
+        Args:
+            reference: by the rule, at the steps (N + 1, 3).
+            path: the commanded motion now.
+            desired: pose at the start of the reference of a log; None: there is none.
+        """
         position, euler = reference.position, reference.euler
+        if self.at_rest:
+            still = jnp.abs(reference.velocity[0]) < self.at_rest
+            position = position + jnp.where(still, path.position - position[0], 0.0)
+            still = jnp.abs(reference.ang_velocity[0]) < self.at_rest
+            euler = euler + jnp.where(still, path.euler - euler[0], 0.0)
         if self.height is not None:
             position = position.at[:, 2].set(self.height)
         if desired is not None:
