@@ -16,7 +16,6 @@ from hector_jax.control.weights import (
 )
 from hector_jax.core.inputs import InputError
 from hector_jax.grfm import dataset
-from hector_jax.grfm.collection import collect
 from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import load_robot
@@ -25,6 +24,7 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 from hector_jax.store import nets, tunings
+from hector_jax.store.collection import collect
 from hector_jax.store.nets import CollectConfig
 from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
@@ -113,7 +113,7 @@ def test_several_losses_count_alike_without_drawn_models_with_which_the_start_fa
 ):
     """The loss is the duration of the command, times more for a model of a higher seed."""
 
-    def tune_step(config, scenario, weights):
+    def evaluated(config, scenario, weights, loss):
         seed = 0 if scenario.variation is None else int(scenario.variation.seed)
         loss = scenario.command.duration[0] * (1.0 + seed)
         fallen = np.array(float(draws > 0 and seed >= stand))
@@ -122,7 +122,7 @@ def test_several_losses_count_alike_without_drawn_models_with_which_the_start_fa
     def matrix(config, scenario, weights, loss, *, others):
         return np.eye(18)
 
-    instead(monkeypatch, tunings.difftune, "tune_step", tune_step)
+    monkeypatch.setattr(tunings.evaluate, "evaluate_jit", evaluated)
     instead(monkeypatch, tunings.difftune, "gauss_newton_jit", matrix)
     commands = [named_command("s")._replace(duration=np.array([size])) for size in sizes]
     problem = tunings.Problem(tuple(commands), None, draws)

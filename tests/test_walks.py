@@ -114,7 +114,7 @@ def test_any_engine_walks_and_is_recorded(robot, in_process, tmp_path):
     assert len(jobs) == 1
     assert score.loss == in_process[2][0].losses[0]
     walks.read_history(one)
-    with pytest.raises(InputError, match="its engine is mine"):
+    with pytest.raises(InputError, match="made with engine .mine"):
         walks.read_history(replace(one, engine=MUJOCO_C))
 
 
@@ -131,7 +131,7 @@ def test_the_plain_model_is_not_grounded(robot, pool, in_process):
 
 def test_the_record_of_another_tuning_is_refused(robot, in_process):
     one = replace(in_process[0], seed=1)
-    with pytest.raises(InputError, match=r"its seed is 0, expected 1"):
+    with pytest.raises(InputError, match=r"made with seed 0, this command expects 1"):
         walks.read_history(one)
 
 

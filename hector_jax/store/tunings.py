@@ -23,6 +23,7 @@ from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.console import bar, say
 from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import plural
+from hector_jax.core.journal import add_row, write_rows
 from hector_jax.core.tree import stack
 from hector_jax.grfm import network
 from hector_jax.robot.model import Robot
@@ -31,7 +32,7 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
 from hector_jax.store.cache import content_key, load_or_make
-from hector_jax.store.folder import add_iteration, write_histories
+from hector_jax.store.folder import as_row
 from hector_jax.store.setup import Setup
 from hector_jax.tuning import batch, difftune, evaluate
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning, step_status
@@ -53,13 +54,6 @@ class Problem(NamedTuple):
     draws: int = 0  # drawn variations of the model for each command; 0: the model as it is
 
 
-class Tuned(NamedTuple):
-    """A tuning with its history."""
-
-    tuning: Tuning
-    commit: str  # of the code that made it; empty if unknown
-
-
 def artefact(setup: Setup, start: Weights) -> dict[str, Any]:
     """Return the options of `load_or_make` for tunings."""
     config, empty = setup.config, np.zeros(0)
@@ -68,7 +62,7 @@ def artefact(setup: Setup, start: Weights) -> dict[str, Any]:
     terms = {term.name: empty for term in config.loss}
     evaluation = evaluate.Evaluation(empty, terms, rows, empty, empty)
     history = Iteration(empty, rows, evaluation, empty, empty)
-    like = Tuned(Tuning(weights, np.zeros(()), np.zeros((0, 0)), np.zeros(()), history), "")
+    like = Tuning(weights, np.zeros(()), np.zeros((0, 0)), np.zeros(()), history)
     return {"like": lambda _: like, "kind": "tuning", "robot": setup.robot}
 
 
@@ -95,7 +89,7 @@ def rollouts_of(config: TuneConfig, robot: Robot, problem: Problem) -> list[Scen
 def _evaluation_job(
     config: TuneConfig, scenario: Scenario, weights: Weights
 ) -> evaluate.Evaluation:
-    return jax.device_get(difftune.tune_step(config, scenario, weights))
+    return jax.device_get(evaluate.evaluate_jit(config.rollout, scenario, weights, config.loss))
 
 
 def _matrix_job(
@@ -134,7 +128,7 @@ def _objective(setup: Setup, start: Weights, problem: Problem) -> Objective:
 
     All rollouts of an evaluation, or their matrices, are computed at the same time.
     """
-    pool, config, robot, _ = setup
+    pool, config, robot = setup
 
     def of_all(
         job: Callable[..., Any], scenarios: Sequence[Scenario], weights: Weights
@@ -160,7 +154,7 @@ def _tune_on_cpu(
 
 def _tune_on_gpu(setup: Setup, start: Weights, problem: Problem) -> Tuning:
     """Run one tuning on the accelerator, as a batch of one."""
-    _, config, robot, _ = setup
+    _, config, robot = setup
     models, losses = rollouts_of(config, robot, problem), np.ones(1)
     if len(models) > 1:
         at = difftune.init(config, start).start
@@ -189,7 +183,7 @@ def _tunings(
     problems: Mapping[str, Problem],
     title: str,
     on_iteration: Callable[[str, Iteration], None],
-) -> Iterator[tuple[str, Tuned]]:
+) -> Iterator[tuple[str, Tuning]]:
     """Tune several problems in parallel and yield each tuning with its name when it ends.
 
     Where there is a GPU they are tuned there, in turn; else threads of this process step the
@@ -202,7 +196,7 @@ def _tunings(
                 tuning = _tune_on_gpu(setup, start, problem)
                 for iteration in tuning.iterations:
                     on_iteration(name, iteration)
-                yield name, Tuned(tuning, setup.commit)
+                yield name, tuning
         return
     done, total = 0, setup.config.iterations * len(problems)
     messages: SimpleQueue[tuple[str, Iteration]] = SimpleQueue()
@@ -223,7 +217,7 @@ def _tunings(
                 report_progress(done, total, remark)
                 on_iteration(name, iteration)
             for future in ended:
-                yield running.pop(future), Tuned(future.result(), setup.commit)
+                yield running.pop(future), future.result()
 
 
 def tune_all(
@@ -234,8 +228,8 @@ def tune_all(
     title: str,
     start: Weights | None = None,
     metrics: Path | None = None,
-    before: Mapping[str, Tuned] | None = None,
-) -> dict[str, Tuned]:
+    before: Mapping[str, Tuning] | None = None,
+) -> dict[str, Tuning]:
     """Tune several problems in parallel; finished tunings are saved in `folder`.
 
     For a problem with several commands the mean of the losses is minimised, each divided by its
@@ -247,7 +241,7 @@ def tune_all(
         folder: folder of the tunings, a file for each; tunings in it are not repeated.
         start: weights at the start; the nominal weights by default.
         title: title of the progress bar.
-        metrics: file of the iterations, see `folder.as_line`.
+        metrics: file of the iterations, see `folder.as_row`.
         before: earlier tunings whose iterations are in that file too.
 
     Raises:
@@ -262,16 +256,16 @@ def tune_all(
         phi = "" if net is None else function_id(network.variant_of(net).apply)
         paths[name] = folder / f"tuning-{name}-{key(*problem, phi)}.npz"
 
-    def write(tuned: Mapping[str, Tuned]) -> None:
+    def write(tuned: Mapping[str, Tuning]) -> None:
         if metrics is not None:
             histories = {**(before or {}), **tuned}.items()
-            write_histories(metrics, {name: t.tuning.iterations for name, t in histories})
+            write_rows(metrics, (as_row(name, i) for name, t in histories for i in t.iterations))
 
     def on_iteration(name: str, iteration: Iteration) -> None:
         if metrics is not None:
-            add_iteration(metrics, name, iteration)
+            add_row(metrics, as_row(name, iteration))
 
-    def make(missing: list[str], stored: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuned]]:
+    def make(missing: list[str], stored: Mapping[str, Tuning]) -> Iterator[tuple[str, Tuning]]:
         write(stored)
         remaining = {name: problems[name] for name in missing}
         return _tunings(setup, start, remaining, title, on_iteration)
@@ -292,7 +286,7 @@ def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, 
 def mean_norms(setup: Setup, problems: Mapping[str, Problem]) -> dict[str, dict[str, float]]:
     """Return norms of the gradients of the loss terms at nominal weights, means over commands."""
     with bar("norms of the gradients") as report_progress:
-        pool, config, robot, _ = setup
+        pool, config, robot = setup
         running = {n: pool.submit(_norms_job, config, robot, p) for n, p in problems.items()}
         report_progress(0, len(problems), "compiling")
         return {name: future.result() for name, future in running.items()}
@@ -322,7 +316,7 @@ def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
     problems = {name: Problem((named_command(name),), None) for name in COMMANDS}
     title = "tuning paths on the rigid body, for the data"
     tuned = tune_all(Setup(pool, tune_config(robot), robot), problems, folder, title=title)
-    histories = [tuned[name].tuning.iterations for name in COMMANDS]
+    histories = [tuned[name].iterations for name in COMMANDS]
     return [stack([i.weights for i in history if i.accepted]) for history in histories]
 
 
@@ -330,7 +324,8 @@ def _prepare_tuning(config: TuneConfig, robot: Robot, start: Weights, problem: P
     """Compile the programs of a tuning, so that its first call need not."""
     scenario, *_ = rollouts_of(config, robot, problem)
     weights = difftune.init(config, start).start
-    evaluation = jax.device_get(difftune.tune_step(config, scenario, weights))
+    found = evaluate.evaluate_jit(config.rollout, scenario, weights, config.loss)
+    evaluation = jax.device_get(found)
     if not problem.draws:
         difftune.check_start(StepStatus(int(step_status(config, evaluation))), evaluation)
     _matrix_job(config, scenario, weights)
@@ -357,7 +352,7 @@ def compile_programs(
     Raises:
         InputError: with the weights at the start the model falls or a QP is not solved.
     """
-    pool, config, robot, _ = setup
+    pool, config, robot = setup
     job = Job(start, trajectory.command, hfs(robot.description))
     job = on_host(job._replace(seconds=trajectory.seconds or job.seconds))
     walking = pool.submit(

@@ -42,7 +42,7 @@ def losses_on_hfs(
         engine: engine of the walks.
         at_once: number of walks for which a program is compiled; fewer walks are padded to it.
     """
-    pool, config, robot, _ = setup
+    pool, config, robot = setup
     walk, plant = config.rollout.walk, hfs(robot.description)
     seconds = config.rollout.ticks * walk.gait.tick
     cases = [(weights, commands[name]) for name, group in sets.items() for weights in group]

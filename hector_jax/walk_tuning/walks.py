@@ -32,12 +32,12 @@ from hector_jax.core.console import bar, say
 from hector_jax.core.environment import code_hash
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, one_line, plural
+from hector_jax.core.journal import add_row, continue_journal
 from hector_jax.core.settings import read_json
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
 from hector_jax.grfm import network
 from hector_jax.search import few_walks
-from hector_jax.search.cmaes import add_row, read_journal
 from hector_jax.search.few_walks import Model, Proposal, Space, WalkResult
 from hector_jax.sim.loop import Job
 from hector_jax.store import tunings
@@ -149,7 +149,7 @@ def read_history(campaign: Campaign) -> list[Row]:
     Raises:
         InputError: the folder holds the record of another campaign, or a damaged one.
     """
-    size, engine, hint = len(box_of(campaign)), campaign.engine, ""
+    size, engine, remedy = len(box_of(campaign)), campaign.engine, "choose another folder"
     head: dict[str, Any] = {
         "format": 2,
         "robot": robot_hash(campaign.robot),
@@ -163,7 +163,7 @@ def read_history(campaign: Campaign) -> list[Row]:
     if campaign.reported:  # data: neither code nor loss can make them those of another campaign
         settings = {"seconds": campaign.seconds, "numbers": list(campaign.numbers)}
         head |= {"robot": walker_hash(campaign.robot), "settings": settings}
-        hint = f" and begin anew with hector propose --start {campaign.folder}/weights/N.json"
+        remedy += f" and begin anew with hector propose --start {campaign.folder}/weights/N.json"
     else:
         head |= {
             "model": campaign.model,
@@ -178,8 +178,7 @@ def read_history(campaign: Campaign) -> list[Row]:
         losses = np.where(np.isfinite(losses), losses, np.inf)
         return Row(point, row["method"], row["predicted"], losses, float(row["margin"]))
 
-    path, what = campaign.folder / RECORD, "tuning on walks"
-    return read_journal(path, head, what=what, parse=parse, hint=hint)
+    return continue_journal(campaign.folder / RECORD, head, "a tuning on walks", parse, remedy)
 
 
 def _walked(rows: Sequence[Row]) -> list[WalkResult]:
