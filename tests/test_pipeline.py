@@ -1,19 +1,23 @@
 """A net is reused only for its own walks and controller; a loss is one number on either engine."""
 
+import traceback
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-from pretend import instead
+from pretend import call, instead
 from synthetic import synthetic_walk
+from test_walks import HandsOver
 
+from hector_jax.cli import tune
+from hector_jax.control import mpc
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
-from hector_jax.control.weights import (
-    expert,
-    nominal,
-)
+from hector_jax.control.weights import expert, nominal
+from hector_jax.control.weights_file import save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.grfm import dataset
 from hector_jax.grfm.jobs import draw_jobs
@@ -132,6 +136,25 @@ def test_several_losses_count_alike_without_drawn_models_with_which_the_start_fa
     said = " ".join(capsys.readouterr().err.split())
     told = "1 of 3 drawn models left out of the tuning: the weights at the start fall"
     assert (told in said) == (stand == 2)
+
+
+def test_from_the_command_to_the_qp_the_stack_has_14_frames(monkeypatch, tmp_path):
+    """Where the programs of a tuning are compiled, in one process; the table is in CONTRIBUTING."""
+    frames, package = [], str(Path(tunings.__file__).parents[1])
+
+    def solve_qp(*_):
+        frames.extend(f for f in traceback.extract_stack() if f.filename.startswith(package))
+        raise InputError("the QP")
+
+    monkeypatch.setattr(mpc, "solve_qp", solve_qp)
+    monkeypatch.setattr(tunings, "not_the_weights", slice)  # any function of three
+    monkeypatch.setattr(tune, "workers", lambda _: nullcontext(HandsOver()))
+    trajectory, start = tmp_path / "brief.toml", tmp_path / "start.json"
+    trajectory.write_text('name = "brief"\n[[segment]]\nseconds = 0.15\nv_x = 0.2\n')
+    save_weights(start, nominal())
+    flags = ("--traj", trajectory, "--start", start, "--out", tmp_path / "run")
+    assert call(monkeypatch, "tune", *flags) == 2
+    assert len(frames) + 1 == 14  # with that of `solve_qp`
 
 
 @pytest.mark.slow

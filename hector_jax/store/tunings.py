@@ -134,7 +134,7 @@ def _objective(setup: Setup, start: Weights, problem: Problem) -> Objective:
         job: Callable[..., Any], scenarios: Sequence[Scenario], weights: Weights
     ) -> list[Any]:
         host = jax.tree.map(np.asarray, weights)
-        return [f.result() for f in [pool.submit(job, config, s, host) for s in scenarios]]
+        return list(pool.map(job, repeat(config), scenarios, repeat(host)))
 
     scenarios, losses = rollouts_of(config, robot, problem), np.ones(1)
     if len(scenarios) > 1:
