@@ -67,8 +67,9 @@ def run_report(args: Report) -> None:
     texts = list(map(str, args.logs))
     files = _files(texts, list(campaign.commands))
     with locked(args.folder), workers(args.processes) as pool:
-        number = len(walks.read_history(campaign))
-        if (proposal := walks.pending(campaign, number)) is None:
+        before, proposal = walks.read_record(campaign)
+        number = len(before)
+        if proposal is None:
             raise InputError(f"{args.folder}: no walk is waited for; begin with hector propose")
         named = [name for name, _ in map(named_file, texts)]
         tracked = _check_logs(campaign, number, files, named)

@@ -4,9 +4,9 @@ Whether a simulator (`tune_on_walks`) or a real robot (`hector propose`, `hector
 same functions read the logs and make the proposals (search/few_walks.py), and all that they use is
 in the folder:
 
-- `walks.jsonl`: settings, then a line for each proposal that was walked.
+- `walks.jsonl`: settings, then a line for each proposal and, once it was walked, one for its walk.
 - `logs/3-0.npz`: the log of walk 3 in case 0, at the plan interval, or the file that was reported.
-- `weights/3.json`, `proposals/3.json`: the weights of walk 3, and how they were proposed.
+- `weights/3.json`: the weights of walk 3.
 - `metric.npz`: the Gauss-Newton matrix at the start, which defines the coordinates of all points.
 
 A weight set is walked in each case: all commands, on each plant. Its loss is the mean over the
@@ -30,10 +30,8 @@ from hector_jax.control.weights import Weights, direction_names
 from hector_jax.control.weights_file import save_weights, weights_tree
 from hector_jax.core.console import bar, say
 from hector_jax.core.environment import code_hash
-from hector_jax.core.files import write_json
-from hector_jax.core.inputs import InputError, one_line, plural
+from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.journal import add_row, continue_journal
-from hector_jax.core.settings import read_json
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
 from hector_jax.grfm import network
@@ -141,8 +139,8 @@ def campaign_space(pool: Executor, campaign: Campaign) -> Space:
     return few_walks.space_of(tree["matrix"], box_of(campaign))
 
 
-def read_history(campaign: Campaign) -> list[Row]:
-    """Return the walks so far; begin the record if the campaign is new.
+def read_record(campaign: Campaign) -> tuple[list[Row], Proposal | None]:
+    """Return the walks so far and the proposal that waits for its walk; begin a new record.
 
     Those that were reported are scored as they were then: see `reported_walks.read_reports`.
 
@@ -151,7 +149,7 @@ def read_history(campaign: Campaign) -> list[Row]:
     """
     size, engine, remedy = len(box_of(campaign)), campaign.engine, "choose another folder"
     head: dict[str, Any] = {
-        "format": 2,
+        "format": 3,
         "robot": robot_hash(campaign.robot),
         "start": weights_tree(campaign.start),
         "settings": content_key(campaign.config, campaign.start, code=()),
@@ -171,14 +169,21 @@ def read_history(campaign: Campaign) -> list[Row]:
             "code": code_hash("walk_tuning.walks", *engine.modules),
         }
 
-    def parse(row: Mapping[str, Any]) -> Row:
-        point, losses = np.array(row["point"], float), np.array(row["losses"], float)
-        if (got := (point.shape, losses.shape)) != ((size,), (len(campaign.cases),)):
-            raise ValueError(f"point and losses of shapes {got}")
-        losses = np.where(np.isfinite(losses), losses, np.inf)
-        return Row(point, row["method"], row["predicted"], losses, float(row["margin"]))
+    def parse(row: Mapping[str, Any]) -> Any:  # a `Proposal`, or losses and margin of its walk
+        name, length = ("losses", len(campaign.cases)) if "losses" in row else ("point", size)
+        if (values := np.array(row[name], float)).shape != (length,):
+            raise ValueError(f"{name} of shape {values.shape}")
+        if name == "point":
+            return Proposal(values, row["method"], row["predicted"])
+        return np.where(np.isfinite(values), values, np.inf), float(row["margin"])
 
-    return continue_journal(campaign.folder / RECORD, head, "a tuning on walks", parse, remedy)
+    path = campaign.folder / RECORD
+    lines = continue_journal(path, head, "a tuning on walks", parse, remedy)
+    proposals, walked = lines[::2], lines[1::2]
+    if not all(isinstance(line, Proposal) == (i % 2 == 0) for i, line in enumerate(lines)):
+        raise InputError(f"{path}: a walk without a proposal, or a proposal without a walk")
+    rows = [Row(*proposal, *walk) for proposal, walk in zip(proposals, walked, strict=False)]
+    return rows, proposals[-1] if len(proposals) > len(walked) else None
 
 
 def _walked(rows: Sequence[Row]) -> list[WalkResult]:
@@ -198,14 +203,14 @@ def next_proposal(
     """Return the next proposal, saved in the folder; it stays the same until it is walked.
 
     Raises:
-        InputError: the start fell, the file of the proposal is damaged, or packages of the extra
-            `search` are missing.
+        InputError: the start fell, or packages of the extra `search` are missing.
     """
     if rows and not _stood(rows[0]):
         raise InputError(
             f"{campaign.folder}: the start fell, or a QP was not solved; tune from another"
         )
-    if (proposal := pending(campaign, len(rows))) is not None:
+    _, proposal = read_record(campaign)
+    if proposal is not None:
         return proposal, weights_at(campaign, space, proposal.point)
     history = _walked(rows)
     has_model = campaign.model != "none" and few_walks.needs_model(history)
@@ -213,32 +218,13 @@ def next_proposal(
     proposal = few_walks.propose(space, history, model, campaign.seed)
     weights = weights_at(campaign, space, proposal.point)
     save_weights(weights_path(campaign.folder, len(rows)), weights)
-    fields = {**proposal._asdict(), "point": proposal.point.tolist()}
-    write_json(proposal_path(campaign, len(rows)), fields)
+    _add_proposal(campaign, proposal)
     return proposal, weights
 
 
-def pending(campaign: Campaign, number: int) -> Proposal | None:
-    """Return the proposal of the next walk, of this number, if it was made.
-
-    Raises:
-        InputError: its file is damaged.
-    """
-    if not (path := proposal_path(campaign, number)).exists():
-        return None
-    table = read_json(path, "a proposal")
-    try:
-        point = np.array(table["point"], float)
-        if point.shape != (len(box_of(campaign)),):
-            raise ValueError(f"a point of shape {point.shape}")
-        return Proposal(point, table["method"], table["predicted"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: damaged: {one_line(error)}; remove it") from None
-
-
-def proposal_path(campaign: Campaign, number: int) -> Path:
-    """Return the file of the proposal of a walk."""
-    return campaign.folder / "proposals" / f"{number}.json"
+def _add_proposal(campaign: Campaign, proposal: Proposal) -> None:
+    fields = {**proposal._asdict(), "point": proposal.point.tolist()}
+    add_row(campaign.folder / RECORD, fields)
 
 
 def weights_path(folder: Path, number: int) -> Path:
@@ -304,16 +290,17 @@ def _model(pool: Executor, campaign: Campaign, space: Space, rows: Sequence[Row]
 def add_walk(
     campaign: Campaign, rows: Sequence[Row], proposal: Proposal, cases: Sequence[ScoredLog]
 ) -> list[Row]:
-    """Append a walk to the history and save it in the folder: first its logs, then its row.
+    """Append a walk to the history and save it in the folder: first its logs, then its line.
 
-    The logs of a walk that was reported are there already.
+    The logs of a walk that was reported are there already, and mostly its proposal.
     """
+    if read_record(campaign)[1] is None:
+        _add_proposal(campaign, proposal)
     if not campaign.reported:
         for path, (_, log) in zip(log_paths(campaign, len(rows)), cases, strict=True):
             save_tree(path, log, kind="log", robot=campaign.robot)
     row = row_of(proposal, cases)
-    arrays = {"point": row.point.tolist(), "losses": row.losses.tolist()}
-    add_row(campaign.folder / RECORD, row._asdict() | arrays)
+    add_row(campaign.folder / RECORD, {"losses": row.losses.tolist(), "margin": row.margin})
     return [*rows, row]
 
 
@@ -342,13 +329,10 @@ def tune_on_walks(pool: Executor, campaign: Campaign, walks: int) -> list[Row]:
             nothing is tuned.
 
     Raises:
-        InputError: see `next_proposal` and `read_history`.
+        InputError: see `next_proposal` and `read_record`.
     """
-    rows, space, cases = (
-        read_history(campaign),
-        campaign_space(pool, campaign),
-        len(campaign.cases),
-    )
+    space, cases = campaign_space(pool, campaign), len(campaign.cases)
+    rows, _ = read_record(campaign)
     with bar(f"tuning with {plural(walks, 'walk')}") as report_progress:
         while not rows or (_stood(rows[0]) and (len(rows) + 1) * cases <= walks):
             report_progress(len(rows) * cases, walks, _progress(campaign, space, rows))
