@@ -117,17 +117,17 @@ def test_several_losses_count_alike_without_drawn_models_with_which_the_start_fa
 ):
     """The loss is the duration of the command, times more for a model of a higher seed."""
 
-    def evaluated(config, scenario, weights, loss):
+    def evaluated(config, scenario, weights, loss, *, walk):
         seed = 0 if scenario.variation is None else int(scenario.variation.seed)
         loss = scenario.command.duration[0] * (1.0 + seed)
         fallen = np.array(float(draws > 0 and seed >= stand))
         return Evaluation(loss, {}, nominal(), fallen, np.array(0.0))
 
-    def matrix(config, scenario, weights, loss, *, others):
+    def matrix(config, scenario, weights, loss, *, walk, others):
         return np.eye(18)
 
-    monkeypatch.setattr(tunings.evaluate, "evaluate_jit", evaluated)
-    instead(monkeypatch, tunings.difftune, "gauss_newton_jit", matrix)
+    monkeypatch.setattr(tunings, "evaluate_jit", evaluated)
+    instead(monkeypatch, tunings, "gauss_newton_jit", matrix)
     commands = [named_command("s")._replace(duration=np.array([size])) for size in sizes]
     problem = tunings.Problem(tuple(commands), None, draws)
     setup = Setup(ThreadPoolExecutor(2), TuneConfig(), ROBOT)

@@ -148,7 +148,7 @@ def test_a_net_of_four_feet_is_fitted_stored_and_read(tmp_path, data, variant, n
     assert name == variant
     jax.tree.map(np.testing.assert_array_equal, again, params)
     window = jax.tree.map(lambda x: jnp.asarray(x[7]), data.window)
-    effect = as_effect(params)(window)
+    effect = jax.jit(as_effect(params))(window)
     assert effect.wrench.force.shape == effect.wrench.moment.shape == (4, 3)
     assert np.any(effect.wrench.force)
     assert not np.any(effect.wrench.moment)

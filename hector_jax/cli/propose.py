@@ -123,8 +123,10 @@ def _check_logs(
     The user said of which trajectory the `named` ones are.
     """
     robot, path = campaign.robot, walks.weights_path(campaign.folder, number)
-    walked = load_weights(path, robot), robot, campaign.seconds
-    proposed = {n: walk_log.walk_card(n, x, *walked) for n, x in campaign.commands.items()}
+    weights, seconds = load_weights(path, robot), campaign.seconds
+    proposed = {
+        n: walk_log.walk_card(n, x, weights, robot, seconds) for n, x in campaign.commands.items()
+    }
     result, before = {}, [p for n in range(number) for p in walks.log_paths(campaign, n)]
     for name, file in files.items():
         tick = campaign.config.rollout.walk.gait.tick

@@ -187,10 +187,11 @@ class CmaSearch:
 
     def parse(self, row: Mapping[str, Any]) -> Generation:
         """Return the generation of a row of the journal; ValueError if its size is wrong."""
-        generation, size = to_generation(row["steps"], row["losses"]), self.config.population
-        expected = (size, len(direction_names(self.start))), (size,)
-        if (got := tuple(x.shape for x in generation)) != expected:
-            raise ValueError("steps {} and losses {}, expected {} and {}".format(*got, *expected))
+        steps, losses = generation = to_generation(row["steps"], row["losses"])
+        size, count = self.config.population, len(direction_names(self.start))
+        if (steps.shape, losses.shape) != ((size, count), (size,)):
+            got = f"{steps.shape} and losses {losses.shape}"
+            raise ValueError(f"steps {got}, expected {(size, count)} and {(size,)}")
         return generation
 
 

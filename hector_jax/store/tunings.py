@@ -34,11 +34,19 @@ from hector_jax.sim.world import hfs
 from hector_jax.store.cache import content_key, load_or_make
 from hector_jax.store.folder import as_row
 from hector_jax.store.setup import Setup
-from hector_jax.tuning import batch, difftune, evaluate
+from hector_jax.tuning import batch, difftune
+from hector_jax.tuning.curvature import gauss_newton_jit
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning, step_status
-from hector_jax.tuning.evaluate import Objective, mean_objective
+from hector_jax.tuning.evaluate import (
+    Evaluation,
+    Objective,
+    Walk,
+    evaluate_jit,
+    gradient_norms,
+    mean_objective,
+)
 from hector_jax.tuning.loss import loss_of_robot
-from hector_jax.tuning.rollout import Scenario, rollout_config
+from hector_jax.tuning.rollout import Scenario, rollout, rollout_config
 from hector_jax.tuning.status import StepStatus
 from hector_jax.tuning.variation import drawn_variation
 
@@ -60,7 +68,7 @@ def artefact(setup: Setup, start: Weights) -> dict[str, Any]:
     weights = difftune.init(config, start).start  # with the other numbers that are tuned
     rows = jax.tree.map(lambda w: np.zeros((0, *w.shape)), weights)
     terms = {term.name: empty for term in config.loss}
-    evaluation = evaluate.Evaluation(empty, terms, rows, empty, empty)
+    evaluation = Evaluation(empty, terms, rows, empty, empty)
     history = Iteration(empty, rows, evaluation, empty, empty)
     like = Tuning(weights, np.zeros(()), np.zeros((0, 0)), np.zeros(()), history)
     return {"like": lambda _: like, "kind": "tuning", "robot": setup.robot}
@@ -86,23 +94,26 @@ def rollouts_of(config: TuneConfig, robot: Robot, problem: Problem) -> list[Scen
     return scenarios
 
 
-def _evaluation_job(
-    config: TuneConfig, scenario: Scenario, weights: Weights
-) -> evaluate.Evaluation:
-    return jax.device_get(evaluate.evaluate_jit(config.rollout, scenario, weights, config.loss))
+def evaluation_job(
+    config: TuneConfig, scenario: Any, weights: Weights, walk: Walk = rollout
+) -> Evaluation:
+    """Evaluate weights, see `evaluate`; a job of a worker process."""
+    return jax.device_get(evaluate_jit(config.rollout, scenario, weights, config.loss, walk=walk))
 
 
-def _matrix_job(
-    config: TuneConfig, scenario: Scenario, weights: Weights
+def matrix_job(
+    config: TuneConfig, scenario: Any, weights: Weights, walk: Walk = rollout
 ) -> Float[np.ndarray, "n n"]:
-    return np.asarray(difftune.model_objective(config, scenario).matrix(weights))
+    """Compute the matrix of weights, see `gauss_newton`; a job of a worker process."""
+    inputs = {"walk": walk, "others": config.others}
+    return np.asarray(gauss_newton_jit(config.rollout, scenario, weights, config.loss, **inputs))
 
 
 def _usable(
     config: TuneConfig,
     problem: Problem,
     scenarios: list[Scenario],
-    found: Sequence[evaluate.Evaluation],
+    found: Sequence[Evaluation],
 ) -> tuple[list[Scenario], Float[np.ndarray, " n"]]:
     """Return the rollouts of a problem that count, and their losses at the start.
 
@@ -138,10 +149,10 @@ def _objective(setup: Setup, start: Weights, problem: Problem) -> Objective:
 
     scenarios, losses = rollouts_of(config, robot, problem), np.ones(1)
     if len(scenarios) > 1:
-        found = of_all(_evaluation_job, scenarios, start)
+        found = of_all(evaluation_job, scenarios, start)
         scenarios, losses = _usable(config, problem, scenarios, found)
-    evaluations = partial(of_all, _evaluation_job, scenarios)
-    return mean_objective(evaluations, partial(of_all, _matrix_job, scenarios), losses)
+    evaluations = partial(of_all, evaluation_job, scenarios)
+    return mean_objective(evaluations, partial(of_all, matrix_job, scenarios), losses)
 
 
 def _tune_on_cpu(
@@ -158,7 +169,7 @@ def _tune_on_gpu(setup: Setup, start: Weights, problem: Problem) -> Tuning:
     models, losses = rollouts_of(config, robot, problem), np.ones(1)
     if len(models) > 1:
         at = difftune.init(config, start).start
-        found = [_evaluation_job(config, model, at) for model in models]
+        found = [evaluation_job(config, model, at) for model in models]
         models, losses = _usable(config, problem, models, found)
     effects = [model.effect for model in (models if problem.draws else models[:1])]
     scenarios = [
@@ -277,7 +288,7 @@ def tune_all(
 
 def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:
     results = [
-        evaluate.gradient_norms(config.rollout, scenario, nominal(robot), config.loss)
+        gradient_norms(config.rollout, scenario, nominal(robot), config.loss)
         for scenario in rollouts_of(config, robot, problem)
     ]
     return jax.tree.map(lambda *x: float(np.mean(x)), *results)
@@ -324,11 +335,11 @@ def _prepare_tuning(config: TuneConfig, robot: Robot, start: Weights, problem: P
     """Compile the programs of a tuning, so that its first call need not."""
     scenario, *_ = rollouts_of(config, robot, problem)
     weights = difftune.init(config, start).start
-    found = evaluate.evaluate_jit(config.rollout, scenario, weights, config.loss)
+    found = evaluate_jit(config.rollout, scenario, weights, config.loss, walk=rollout)
     evaluation = jax.device_get(found)
     if not problem.draws:
         difftune.check_start(StepStatus(int(step_status(config, evaluation))), evaluation)
-    _matrix_job(config, scenario, weights)
+    matrix_job(config, scenario, weights)
 
 
 def compile_programs(
@@ -358,12 +369,12 @@ def compile_programs(
     walking = pool.submit(
         not_the_weights, config.rollout.walk, jax.tree.map(np.asarray, robot), job
     )
-    plain = config, start, Problem((trajectory.command,), None)
-    configs, starts, problems = zip(plain, *others, strict=True)
-    preparing = pool.map(_prepare_tuning, configs, repeat(robot), starts, problems)
+    inputs = [(config, start, Problem((trajectory.command,), None)), *others]
+    preparing = [pool.submit(_prepare_tuning, c, robot, w, p) for c, w, p in inputs]
     meanwhile()
     with bar("compiling, once on a machine") as report_progress:
-        report_progress(0, len(configs), "")
-        for done, _ in enumerate(preparing, 1):
-            report_progress(done, len(configs), "")
+        report_progress(0, len(preparing), "")
+        for done, job in enumerate(preparing, 1):
+            job.result()
+            report_progress(done, len(preparing), "")
     return walking.result()

@@ -41,9 +41,7 @@ from hector_jax.sim.loop import Job
 from hector_jax.store import tunings
 from hector_jax.store.cache import content_key, robot_hash
 from hector_jax.store.setup import Setup
-from hector_jax.tuning.curvature import gauss_newton_jit
-from hector_jax.tuning.difftune import TuneConfig, step_status
-from hector_jax.tuning.evaluate import Evaluation, evaluate_jit
+from hector_jax.tuning.difftune import step_status
 from hector_jax.tuning.grounded import Grounding, fit_grounding, grounded_rollout
 from hector_jax.tuning.rollout import Scenario
 from hector_jax.tuning.status import StepStatus
@@ -103,20 +101,11 @@ def _ground_job(campaign: Campaign, weights: Weights, command: Command, log: Log
     return jax.device_get(grounding)
 
 
-def _evaluate_job(config: TuneConfig, grounding: Grounding, weights: Weights) -> Evaluation:
-    inputs = config.rollout, grounding, weights, config.loss
-    return jax.device_get(evaluate_jit(*inputs, walk=grounded_rollout))
-
-
-def _matrix_job(config: TuneConfig, grounding: Grounding, weights: Weights) -> Any:
-    inputs = config.rollout, grounding, weights, config.loss
-    return np.asarray(gauss_newton_jit(*inputs, walk=grounded_rollout, others=config.others))
-
-
 def row_of(proposal: Proposal, cases: Sequence[ScoredLog]) -> Row:
     """Return the row of a proposal and the scores of its walks."""
-    losses = np.array([score.loss for score, _ in cases])
-    return Row(*proposal, losses, max(score.margin for score, _ in cases))
+    losses, margin = zip(*((score.loss, score.margin) for score, _ in cases), strict=True)
+    point, method, predicted = proposal
+    return Row(point, method, predicted, np.array(losses), max(margin))
 
 
 # The folder
@@ -240,11 +229,11 @@ def log_paths(campaign: Campaign, number: int) -> list[Path]:
 
 def evaluate_logs(pool: Executor, campaign: Campaign, number: int) -> list[ScoredLog]:
     """Evaluate the logs of a walk that was reported; see `evaluate_log`."""
-    paths, commands = log_paths(campaign, number), [command for _, command in campaign.cases]
-    tick = campaign.config.rollout.walk.gait.tick
-    logs = [read_log(path, campaign.robot, campaign.seconds, tick) for path in paths]
-    inputs = repeat(campaign.config), repeat(campaign.robot), commands, logs
-    return list(pool.map(evaluate_log, *inputs))
+    config, robot, running = campaign.config, campaign.robot, []
+    for path, (_, command) in zip(log_paths(campaign, number), campaign.cases, strict=True):
+        log = read_log(path, robot, campaign.seconds, config.rollout.walk.gait.tick)
+        running.append(pool.submit(evaluate_log, config, robot, command, log))
+    return [job.result() for job in running]
 
 
 def _plan_logs(pool: Executor, campaign: Campaign, number: int) -> list[Log]:
@@ -261,27 +250,31 @@ def _model(pool: Executor, campaign: Campaign, space: Space, rows: Sequence[Row]
     best = few_walks.best_walk(_walked(rows))
     weights = weights_at(campaign, space, rows[best].point)
     commands = [command for _, command in campaign.cases]
-    inputs = repeat(campaign), repeat(weights), commands, _plan_logs(pool, campaign, best)
-    groundings = list(pool.map(_ground_job, *inputs))
+    logs = _plan_logs(pool, campaign, best)
+    groundings = list(pool.map(_ground_job, repeat(campaign), repeat(weights), commands, logs))
 
     def of_cases(job: Callable[..., Any], weights: Weights) -> list[Any]:
-        return list(pool.map(job, repeat(campaign.config), groundings, repeat(weights)))
+        running = [
+            pool.submit(job, campaign.config, grounding, weights, grounded_rollout)
+            for grounding in groundings
+        ]
+        return [job.result() for job in running]
 
-    at_best = of_cases(_evaluate_job, weights)
+    at_best = of_cases(tunings.evaluation_job, weights)
     model_losses = np.array([case.loss for case in at_best])
     scales = rows[best].losses / rows[0].losses / model_losses / len(commands)
 
     def evaluate(point: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
         weights = weights_at(campaign, space, point)
         walked = np.array_equal(point, rows[best].point)
-        cases = at_best if walked else of_cases(_evaluate_job, weights)
+        cases = at_best if walked else of_cases(tunings.evaluation_job, weights)
         if any(step_status(campaign.config, case) != StepStatus.ACCEPTED for case in cases):
             return np.inf, np.zeros_like(point)
         slopes = [slope_of(campaign, space, weights, case.gradient) for case in cases]
         return float(scales @ [float(case.loss) for case in cases]), scales @ np.array(slopes)
 
     def matrix(point: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
-        matrices = of_cases(_matrix_job, weights_at(campaign, space, point))
+        matrices = of_cases(tunings.matrix_job, weights_at(campaign, space, point))
         return matrix_of(campaign, space, np.tensordot(scales, matrices, axes=1))
 
     return Model(evaluate, matrix)
@@ -337,8 +330,8 @@ def tune_on_walks(pool: Executor, campaign: Campaign, walks: int) -> list[Row]:
         while not rows or (_stood(rows[0]) and (len(rows) + 1) * cases <= walks):
             report_progress(len(rows) * cases, walks, _progress(campaign, space, rows))
             proposal, weights = next_proposal(pool, campaign, space, rows)
-            inputs = repeat(campaign), repeat(weights), range(cases)
-            rows = add_walk(campaign, rows, proposal, list(pool.map(walk_case, *inputs)))
+            walked = list(pool.map(walk_case, repeat(campaign), repeat(weights), range(cases)))
+            rows = add_walk(campaign, rows, proposal, walked)
         report_progress(len(rows) * cases, walks, _progress(campaign, space, rows))
     if campaign.leg_numbers and all(row.method in ("start", "model") for row in rows):
         say(f"{', '.join(campaign.leg_numbers)} were not moved: walks beyond the model are needed")
