@@ -369,8 +369,9 @@ def compile_programs(
     walking = pool.submit(
         not_the_weights, config.rollout.walk, jax.tree.map(np.asarray, robot), job
     )
-    inputs = [(config, start, Problem((trajectory.command,), None)), *others]
-    preparing = [pool.submit(_prepare_tuning, c, robot, w, p) for c, w, p in inputs]
+    preparing, plain = [], (config, start, Problem((trajectory.command,), None))
+    for settings, weights, problem in (plain, *others):
+        preparing.append(pool.submit(_prepare_tuning, settings, robot, weights, problem))
     meanwhile()
     with bar("compiling, once on a machine") as report_progress:
         report_progress(0, len(preparing), "")
