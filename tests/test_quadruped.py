@@ -18,12 +18,7 @@ from hector_jax.control.controller import plan_horizon, walk_config
 from hector_jax.control.footstep import Feet
 from hector_jax.control.gait import GaitConfig, gait_named
 from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.weights import (
-    direction_names,
-    expert,
-    nominal,
-    weight_names,
-)
+from hector_jax.control.weights import direction_names, expert, nominal, weight_names
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, Wrench

@@ -229,9 +229,6 @@ def test_a_run_whose_data_are_elsewhere_is_refused_at_once(begun, tmp_path, monk
     ("changed", "given", "message"),
     [
         ({}, "--seeds 8", "run: begun with --seeds 3, got 8"),  # the default
-        ({}, "--traj straight", "run: begun with --traj c, got straight"),
-        ({}, "--smooth 3", "run: begun with --smooth 2.0, got 3"),
-        ({}, "--start nominal", "run: begun with --start expert, got nominal"),
         ({}, "--out other", "only one can be given"),
         ({}, "--each", "run: no runs of single trajectories in it; leave out --each"),
         ({"code": "another"}, "", "run: made by other code or other versions"),

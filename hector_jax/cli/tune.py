@@ -374,8 +374,7 @@ def _result(
 
 def _draw(run: _Run, tuned: _Tuned, standin: ScoredWalks, on_hfs: ScoredWalks) -> dict[str, Any]:
     """Draw the pictures and the film of a run, for its report."""
-    net = tuned.net
-    effects = {"linear": as_effect(net.linear), "residual": as_effect(net.params)}
+    effects = {"linear": as_effect(tuned.net.linear), "residual": as_effect(tuned.net.params)}
     with ThreadPoolExecutor(1) as background:  # another process draws the film
         film = background.submit(_film, run, standin)
         curves = fidelity.curves(run.setup.robot, on_hfs.first["nominal"], effects)
@@ -386,7 +385,7 @@ def _draw(run: _Run, tuned: _Tuned, standin: ScoredWalks, on_hfs: ScoredWalks) -
             tunings=tuned.tunings,
             walks=standin.first,
             ground=curves,
-            training=net.history,
+            training=tuned.net.history,
         )
     return {"pictures": drawings, "film": film.result()}
 
