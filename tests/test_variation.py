@@ -17,13 +17,7 @@ from hector_jax.grfm.effect import ground_effect, last_command
 from hector_jax.robot import srbm
 from hector_jax.robot.description import TuningSettings
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
-from hector_jax.tuning.rollout import (
-    RolloutConfig,
-    Scenario,
-    rollout,
-    rollout_config,
-    with_variation,
-)
+from hector_jax.tuning.rollout import Scenario, rollout, rollout_config, with_variation
 from hector_jax.tuning.variation import (
     drawn_variation,
     estimate_error,
@@ -105,7 +99,7 @@ def test_a_foot_that_slips_keeps_its_direction_and_load():
 
 
 def test_drawn_variations_are_as_robots_differ():
-    config = RolloutConfig().walk
+    config = rollout_config(ROBOT).walk
     drawn = [drawn_variation(config, ROBOT, seed) for seed in range(200)]
     for name, low, high in (
         ("mass", 0.9, 1.1),
@@ -153,7 +147,7 @@ def test_the_description_of_a_robot_states_the_noise_and_the_delay_of_its_tuning
 
 def test_a_tuning_sees_the_noise_and_the_delay_of_the_description():
     config = rollout_config(robot_with(estimate_noise=1.0, delay=0.005), ticks=10)
-    without = RolloutConfig(ticks=10)
+    without = rollout_config(ROBOT, ticks=10)
     walk = partial(jax.jit(rollout, static_argnums=0), weights=nominal())
     seen, told = walk(config, SCENARIO), with_variation(config, SCENARIO)
     assert_same(seen, walk(without, told))
