@@ -35,7 +35,6 @@ from hector_jax.core.trajectory import State, Trajectory
 from hector_jax.core.tree import stack
 from hector_jax.export.export import controller, export_controller, load_controller
 from hector_jax.grfm import dataset, training
-from hector_jax.grfm.collection import Walks
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.grfm.network import as_effect, effect_of
@@ -47,6 +46,7 @@ from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs, ideal
+from hector_jax.store.collection import Walks
 from hector_jax.tuning.difftune import TuneConfig, tune, tune_step
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout

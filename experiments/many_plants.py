@@ -35,6 +35,7 @@ from hector_jax.core.environment import code_hash
 from hector_jax.core.files import make_folder
 from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError, plural, require_package
+from hector_jax.core.journal import add_row, continue_journal
 from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, Range, check
 from hector_jax.core.trajectory import SOLVED
@@ -42,7 +43,7 @@ from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import load_robot
-from hector_jax.search.cmaes import Generation, add_row, read_journal, to_generation
+from hector_jax.search.cmaes import Generation, to_generation
 from hector_jax.sim.engine import Engine, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import Imperfections, named_world
@@ -134,7 +135,7 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
 
     path = campaign.folder / "generations.jsonl"
     rows, space = (
-        read_journal(path, head, what="search", parse=parse),
+        continue_journal(path, head, "a search", parse),
         campaign_space(pool, campaign),
     )
     losses = partial(losses_of, pool, campaign, engine, batch=size * len(campaign.cases))

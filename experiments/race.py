@@ -189,7 +189,7 @@ def _box(campaign: Campaign) -> Float[np.ndarray, "n 2"]:
 def contest_job(campaign: Campaign, contest: Contest, model: Model, budget: int) -> None:
     """Walk a contest to its end, from what is in its folder on."""
     make_folder(campaign.folder)
-    space, rows = _space(campaign, contest, model), walks.read_history(campaign)
+    space, rows = _space(campaign, contest, model), walks.read_record(campaign)[0]
 
     def walk(proposal: Proposal, weights: Weights) -> None:
         rows[:] = walks.add_walk(campaign, rows, proposal, [walks.walk_case(campaign, weights, 0)])
@@ -368,7 +368,9 @@ def main() -> None:
                 report_progress(done, len(contests), contests[done - 1].name)
         budgets, both = _budgets(flags), NOMINAL in sets and len(sets) > 1
         charged = [budget - NET for budget in budgets if both and budget >= NET]
-        rows = {c: walks.read_history(campaigns[c])[: c.rows_after(flags.walks)] for c in contests}
+        rows = {
+            c: walks.read_record(campaigns[c])[0][: c.rows_after(flags.walks)] for c in contests
+        }
         bests = {
             (c, budget): best_of(campaigns[c], c, models[c[:2]], rows[c][: c.rows_after(budget)])
             for c in contests

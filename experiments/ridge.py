@@ -69,7 +69,7 @@ def walk_robot(flags: Flags, pool: Executor, name: str, file: Path | None) -> Lo
         tuned = tunings.tune_all(
             setup, problems, folder, title=f"{name}: tuning with ridge {ridge:g}"
         )
-        sets |= {(key, ridge): found.tuning.weights for key, found in tuned.items()}
+        sets |= {(key, ridge): found.weights for key, found in tuned.items()}
     setup = Setup(pool, tunings.tune_config(robot), robot)
     plants = choice.drawn_plants(robot, flags.plants, FIRST_SEED)
     seeds = range(FIRST_SEED, FIRST_SEED + flags.plants)

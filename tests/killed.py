@@ -21,11 +21,11 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.files import locked
 from hector_jax.core.runtime import setup_jax
-from hector_jax.grfm.collection import collect
 from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.world import hfs
 from hector_jax.store import tunings
+from hector_jax.store.collection import collect
 from hector_jax.store.setup import Setup
 from hector_jax.store.tunings import Problem
 from hector_jax.tuning.difftune import TuneConfig
@@ -58,7 +58,7 @@ def table(folder: Path) -> None:
         for name in problems:
             for iteration in tuning.iterations:
                 on_iteration(name, iteration)
-            yield name, tunings.Tuned(tuning, setup.commit)
+            yield name, tuning
 
     def walks_of(setup, jobs, title, engine):
         for job in jobs:
@@ -71,7 +71,7 @@ def table(folder: Path) -> None:
     with locked(folder):
         tuned = tunings.tune_all(setup, problems, folder / "s", title="", metrics=metrics)
         sets = {"nominal": nominal(), "expert": expert()}
-        sets["without"] = tuned["without"].tuning.weights
+        sets["without"] = tuned["without"].weights
         seeds = range(WALKS // 2)
         plants = [hfs()] * len(seeds)
         judging.judge(setup, sets, S, plants, seeds, title="", folder=folder / "s")

@@ -15,7 +15,6 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.inputs import InputError
 from hector_jax.export.export import find_weights
-from hector_jax.grfm.collection import load_walks
 from hector_jax.robot.description import Description
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.loop import Job
@@ -23,6 +22,7 @@ from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs, ideal
 from hector_jax.store import folder as runs
 from hector_jax.store import nets
+from hector_jax.store.collection import load_walks
 from hector_jax.store.nets import CollectConfig
 
 STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"

@@ -10,8 +10,9 @@ from hector_jax.cli import main as cli
 from hector_jax.cli.flags import Tune
 from hector_jax.cli.parse import as_table
 from hector_jax.core.files import write_json
+from hector_jax.core.journal import write_rows
 from hector_jax.report.compare import compare_runs
-from hector_jax.store.folder import as_line, load_run
+from hector_jax.store.folder import as_row, load_run
 
 
 def verdict(L, falls=0, **changes):
@@ -34,8 +35,8 @@ def run_folder(folder, flags, versions):
     write_json(folder / "result.json", {"alpha": {}, "sets": sets})
     write_json(folder / "config.json", config)
     write_json(folder / "versions.json", {"jax": "1"} | versions)
-    lines = [as_line("with", iteration) for iteration in pretend_history(2, refused=(1,))]
-    (folder / "metrics.jsonl").write_text("".join(lines))
+    rows = [as_row("with", iteration) for iteration in pretend_history(2, refused=(1,))]
+    write_rows(folder / "metrics.jsonl", rows)
     return folder
 
 
@@ -67,7 +68,7 @@ def test_a_comparison_tells_losses_falls_iterations_and_what_differs(monkeypatch
     [
         ("result.json", None, "cannot read a file of a run of `hector tune`: No such file"),
         ("result.json", '{"sets": {"with": {"hfs": {}}}}', "set with has no verdict"),
-        ("metrics.jsonl", "{}\n", "metrics.jsonl, line 1: an iteration"),
+        ("metrics.jsonl", "{}\n", "metrics.jsonl, line 1: a row"),
     ],
 )
 def test_what_is_no_finished_run_is_told_by_its_file(runs, name, text, fault):

@@ -8,13 +8,13 @@ from synthetic import CYCLE, synthetic_walk, turn_walk, turns
 
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.tree import stack
-from hector_jax.grfm.collection import Walks, collect, load_walks
 from hector_jax.grfm.dataset import at_interval, make_dataset, with_mirror
 from hector_jax.grfm.effect import HISTORY, turn
 from hector_jax.grfm.jobs import KINDS, draw_jobs
 from hector_jax.robot import srbm
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.world import Push
+from hector_jax.store.collection import Walks, collect, load_walks
 
 ROBOT, TICKS = load_robot(), 40
 
@@ -189,11 +189,11 @@ def test_a_collection_of_something_else_is_not_overwritten(tmp_path):
     collect(tmp_path, draw_jobs(0, 2), walker([]), robot=ROBOT, settings={"ticks": 4})
     before = (tmp_path / "walk-00000.npz").read_bytes()
     for seed, ticks, fault in (
-        (1, 4, "collected for other walks"),
+        (1, 4, "made with jobs"),
         (0, 5, "made with ticks 4, this command expects 5"),
     ):
         jobs, settings = draw_jobs(seed, 2), {"ticks": ticks}
-        with pytest.raises(ValueError, match=f"walk-00000.npz: {fault}"):
+        with pytest.raises(ValueError, match=f"card.json: {fault}"):
             collect(tmp_path, jobs, walker([]), robot=ROBOT, settings=settings)
     assert (tmp_path / "walk-00000.npz").read_bytes() == before
     with pytest.raises(ValueError, match="walk-00000.npz: made for robot"):

@@ -27,12 +27,13 @@ from hector_jax.control.weights import expert
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.tree_file import save_tree
-from hector_jax.grfm import collection, network
+from hector_jax.grfm import network
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.qp import QpConfig
 from hector_jax.report.video import VideoConfig
 from hector_jax.robot.model import load_robot
 from hector_jax.search.cmaes import SearchConfig
+from hector_jax.store import collection
 from hector_jax.store.nets import CollectConfig
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig

@@ -9,17 +9,18 @@ from pretend import instead, pretend_history, pretend_walk, tuning_of
 
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal
+from hector_jax.core.journal import add_row
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.world import hfs, ideal
 from hector_jax.store import tunings
-from hector_jax.store.folder import as_line
+from hector_jax.store.folder import as_row
 from hector_jax.store.setup import Setup
-from hector_jax.store.tunings import Problem, Tuned
+from hector_jax.store.tunings import Problem
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.verdict import judging
 
 ROBOT, CONFIG, S = load_robot(), TuneConfig(), named_command("s")
-SETUP = Setup(ThreadPoolExecutor(1), CONFIG, ROBOT, "abc")  # which is never asked
+SETUP = Setup(ThreadPoolExecutor(1), CONFIG, ROBOT)  # which is never asked
 TUNING = tuning_of(pretend_history(12, refused=(3, 5)), expert())
 SETS = {"nominal": nominal(), "expert": expert()}
 
@@ -38,7 +39,7 @@ def tuned(monkeypatch):
             names.append(name)
             for iteration in TUNING.iterations:
                 on_iteration(name, iteration)
-            yield name, Tuned(TUNING, setup.commit)
+            yield name, TUNING
 
     instead(monkeypatch, tunings, "_tunings", side_by_side)
     return names
@@ -60,10 +61,9 @@ def walked(monkeypatch):
     return seeds
 
 
-def judge(folder, sets, seeds=(0, 1, 2), plant=hfs, commit="abc"):
+def judge(folder, sets, seeds=(0, 1, 2), plant=hfs):
     plants = [plant()] * len(seeds)
-    setup = SETUP._replace(commit=commit)
-    return judging.judge(setup, sets, S, plants, seeds, title="", folder=folder)
+    return judging.judge(SETUP, sets, S, plants, seeds, title="", folder=folder)
 
 
 def test_a_tuning_comes_back_as_it_was_and_is_made_again_for_another_problem(tmp_path, tuned):
@@ -73,9 +73,7 @@ def test_a_tuning_comes_back_as_it_was_and_is_made_again_for_another_problem(tmp
         return tunings.tune_all(setup, problems, tmp_path, title="", start=start)["without"]
 
     for _ in range(2):  # as tuned, and as kept
-        back, commit = tune()
-        assert commit == "abc"
-        same(back, TUNING)
+        same(tune(), TUNING)
     assert tuned == ["without"]
     tune(TuneConfig(iterations=20))
     tune(command=named_command("c"))
@@ -94,38 +92,30 @@ def test_metrics_of_a_run_that_was_cut_are_those_of_an_uncut_one(tmp_path, tuned
 
     whole = lines(tmp_path / "whole", problems)
     half = lines(tmp_path / "cut", {"with": problems["with"]})
-    with (tmp_path / "cut" / "metrics.jsonl").open("a") as file:
-        file.write(as_line("without", TUNING.iterations[0]))
+    add_row(tmp_path / "cut" / "metrics.jsonl", as_row("without", TUNING.iterations[0]))
     assert lines(tmp_path / "cut", problems) == whole
     assert whole.endswith(half)
     assert tuned == ["without", "with", "with", "without"]
 
 
 def test_walks_that_are_kept_are_not_walked_again(tmp_path, walked):
-    first, second = judge(tmp_path, SETS), judge(tmp_path, SETS, commit="def")
+    first, second = judge(tmp_path, SETS), judge(tmp_path, SETS)
     assert len(walked) == 6
     same([w[:3] for w in first.walks["expert"]], [w[:3] for w in second.walks["expert"]])
     same(first.first, second.first)
-    assert {w.commit for w in second.walks["nominal"]} == {"abc"}
-    more = judge(tmp_path, SETS | {"mine": nominal()}, seeds=(0, 1, 2, 3), commit="def")
+    judge(tmp_path, SETS | {"mine": nominal()}, seeds=(0, 1, 2, 3))
     assert sorted(walked[6:]) == [0, 1, 2, 3, 3, 3]
-    assert [w.commit for w in more.walks["nominal"]] == ["abc"] * 3 + ["def"]
     judge(tmp_path, {"nominal": expert()})
     judge(tmp_path, {"nominal": nominal()}, plant=ideal)
     assert len(walked) == 18
 
 
-def test_a_fall_is_kept_with_its_time_and_last_state(tmp_path, walked):
+def test_a_fall_is_kept_and_a_walk_with_an_unsolved_qp_is_said(tmp_path, walked, capsys):
     for _ in range(2):  # as walked, and as kept
-        walk = judge(tmp_path, {"mine": nominal()}).walks["mine"][2]
+        walk = judge(tmp_path, {"mine": nominal()}, seeds=(0, 2, 4)).walks["mine"][1]
         assert walk.score.fallen
         assert float(walk.upright) == pytest.approx(0.5)
         assert np.isfinite(np.concatenate(walk.last)).all()
-
-
-def test_a_walk_with_an_unsolved_qp_is_said(tmp_path, walked, capsys):
-    for _ in range(2):  # as walked, and as kept
-        judge(tmp_path, {"mine": nominal()}, seeds=(0, 4))
         said = " ".join(capsys.readouterr().err.split())
         assert "mine: at least one QP of its walks was not solved (residual nan)" in said
     judge(tmp_path, {"mine": nominal()}, seeds=(0,))

@@ -1,6 +1,5 @@
 """The loss: sums by hand, the same number in every world, what a fall costs."""
 
-import json
 from dataclasses import replace
 from functools import partial
 
@@ -17,7 +16,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, Wrench, no_samples
 from hector_jax.grfm.effect import last_command
 from hector_jax.report.report import render
-from hector_jax.store.folder import as_line
+from hector_jax.store.folder import as_row
 from hector_jax.tuning.difftune import TuneConfig, tune
 from hector_jax.tuning.loss import (
     PAPER_LOSS,
@@ -130,7 +129,7 @@ def test_a_fourth_term_is_tuned_told_and_written_from_one_place():
     terms = first.evaluation.terms
     assert terms["L_sway"] > 0.0
     assert first.evaluation.loss == pytest.approx(float(total(loss, terms)))
-    assert json.loads(as_line("mine", first))["L_sway"] == pytest.approx(float(terms["L_sway"]))
+    assert as_row("mine", first)["L_sway"] == pytest.approx(float(terms["L_sway"]))
     walks = [metrics.score(loss, pretend_walk())] * 2
     verdict = metrics.make_verdict(loss, [0, 1], {"s": {"nominal": walks, "mine": walks}})
     result = metrics.verdict_result(verdict)

@@ -55,7 +55,7 @@ def test_the_search_finds_the_bottom_and_continues_after_its_generations(campaig
     jax.tree.map(np.testing.assert_array_equal, again, found)
     assert record.read_bytes() == b"".join(lines)
     record.write_bytes(lines[0] + b'{"steps": [[0.0]], "losses": [1.0]}\n')
-    with pytest.raises(InputError, match="line 2 is damaged: steps"):
+    with pytest.raises(InputError, match="line 2: a row of a search was expected .*steps"):
         search(Executor(), campaign, ENGINE, flags)
     record.unlink()
     monkeypatch.setattr(many_plants, "losses_of", lambda *_, batch: iter([np.array([1.0, np.inf])]))

@@ -26,12 +26,7 @@ from hector_jax.control.contact import (
 from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, build_qp, solve_mpc
 from hector_jax.control.parameters import bounds
-from hector_jax.control.weights import (
-    Weights,
-    expert,
-    vector_to_weights,
-    weights_to_vector,
-)
+from hector_jax.control.weights import Weights, expert, vector_to_weights, weights_to_vector
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import from_table, to_table

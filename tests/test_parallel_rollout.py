@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from lib import sample_weights
-from model import ROBOT, SHORT, small_effect
+from model import ROBOT, small_effect
 
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal, vector_to_weights, weights_to_vector
@@ -17,6 +17,7 @@ from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.tuning.variation import no_variation
 
 EFFECT = small_effect()
+SHORT = RolloutConfig(ticks=24)  # in which one falls
 FIELDS = "initial", "state", "reference", "command", "effect", "feet"
 
 

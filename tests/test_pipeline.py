@@ -1,22 +1,25 @@
 """A net is reused only for its own walks and controller; a loss is one number on either engine."""
 
+import traceback
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-from pretend import instead
+from pretend import call, instead
 from synthetic import synthetic_walk
+from test_walks import HandsOver
 
+from hector_jax.cli import tune
+from hector_jax.control import mpc
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
-from hector_jax.control.weights import (
-    expert,
-    nominal,
-)
+from hector_jax.control.weights import expert, nominal
+from hector_jax.control.weights_file import save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.grfm import dataset
-from hector_jax.grfm.collection import collect
 from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import load_robot
@@ -25,6 +28,7 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 from hector_jax.store import nets, tunings
+from hector_jax.store.collection import collect
 from hector_jax.store.nets import CollectConfig
 from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
@@ -71,18 +75,14 @@ def test_a_net_is_trained_once(tmp_path, monkeypatch):
     assert (again.errors, again.held_out_walks) == (first.errors, first.held_out_walks)
 
 
-@pytest.mark.parametrize(
-    ("others", "message"),
-    [
-        ({"seed": 5}, "with seed 5, this command expects 0; remove it, or name another"),
-        ({"paths": "short"}, "with paths 'short', this command expects"),
-        ({"code": "older"}, "by other code or other versions of jax, jaxlib, mujoco"),
-    ],
-)
-def test_walks_of_other_settings_are_refused(tmp_path, others, message):
-    gather(tmp_path / "walks", **others)
-    with pytest.raises(InputError, match=f"walks: made {message}"):
-        ground(tmp_path)
+def test_walks_of_other_settings_are_refused(tmp_path):
+    for name, other, message in (
+        ("seed", 5, "with seed 5, this command expects 0; remove it, or name another"),
+        ("code", "older", "by other code or other versions of jax, jaxlib, mujoco"),
+    ):
+        gather(tmp_path / name / "walks", **{name: other})
+        with pytest.raises(InputError, match=f"walks: made {message}"):
+            ground(tmp_path / name)
 
 
 def test_a_net_of_other_settings_or_other_walks_is_refused_and_stays(tmp_path):
@@ -113,17 +113,17 @@ def test_several_losses_count_alike_without_drawn_models_with_which_the_start_fa
 ):
     """The loss is the duration of the command, times more for a model of a higher seed."""
 
-    def tune_step(config, scenario, weights):
+    def evaluated(config, scenario, weights, loss, *, walk):
         seed = 0 if scenario.variation is None else int(scenario.variation.seed)
         loss = scenario.command.duration[0] * (1.0 + seed)
         fallen = np.array(float(draws > 0 and seed >= stand))
         return Evaluation(loss, {}, nominal(), fallen, np.array(0.0))
 
-    def matrix(config, scenario, weights, loss, *, others):
+    def matrix(config, scenario, weights, loss, *, walk, others):
         return np.eye(18)
 
-    instead(monkeypatch, tunings.difftune, "tune_step", tune_step)
-    instead(monkeypatch, tunings.difftune, "gauss_newton_jit", matrix)
+    monkeypatch.setattr(tunings, "evaluate_jit", evaluated)
+    instead(monkeypatch, tunings, "gauss_newton_jit", matrix)
     commands = [named_command("s")._replace(duration=np.array([size])) for size in sizes]
     problem = tunings.Problem(tuple(commands), None, draws)
     setup = Setup(ThreadPoolExecutor(2), TuneConfig(), ROBOT)
@@ -132,6 +132,25 @@ def test_several_losses_count_alike_without_drawn_models_with_which_the_start_fa
     said = " ".join(capsys.readouterr().err.split())
     told = "1 of 3 drawn models left out of the tuning: the weights at the start fall"
     assert (told in said) == (stand == 2)
+
+
+def test_from_the_command_to_the_qp_the_stack_has_14_frames(monkeypatch, tmp_path):
+    """Where the programs of a tuning are compiled, in one process; the table is in CONTRIBUTING."""
+    frames, package = [], str(Path(tunings.__file__).parents[1])
+
+    def solve_qp(*_):
+        frames.extend(f for f in traceback.extract_stack() if f.filename.startswith(package))
+        raise InputError("the QP")
+
+    monkeypatch.setattr(mpc, "solve_qp", solve_qp)
+    monkeypatch.setattr(tunings, "not_the_weights", slice)  # any function of three
+    monkeypatch.setattr(tune, "workers", lambda _: nullcontext(HandsOver()))
+    trajectory, start = tmp_path / "brief.toml", tmp_path / "start.json"
+    trajectory.write_text('name = "brief"\n[[segment]]\nseconds = 0.15\nv_x = 0.2\n')
+    save_weights(start, nominal())
+    flags = ("--traj", trajectory, "--start", start, "--out", tmp_path / "run")
+    assert call(monkeypatch, "tune", *flags) == 2
+    assert len(frames) + 1 == 14  # with that of `solve_qp`
 
 
 @pytest.mark.slow

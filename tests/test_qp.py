@@ -660,7 +660,10 @@ def test_on_a_gpu_a_wrong_point_of_the_kernel_is_corrected(walking, walked, sett
         np.testing.assert_allclose(found.x, x, atol=1e-9 * np.abs(x).max())
 
 
-@pytest.mark.parametrize(("dtype", "error"), [(np.float64, 1e-9), (np.float32, 1e-3)])
+IN_32_BITS = pytest.param(np.float32, 1e-3, marks=pytest.mark.slow)  # compiles all once more
+
+
+@pytest.mark.parametrize(("dtype", "error"), [(np.float64, 1e-9), IN_32_BITS])
 def test_on_a_gpu_each_verdict_of_a_batch_is_that_of_the_cpu(dtype, error, monkeypatch):
     """Also if the kernel solves a problem but does not prove P definite: a flat one, or 32 bits."""
     P, one = np.diag([1.0, 1.0, 1.0, 1.0, 0.0]), np.ones(9)

@@ -18,12 +18,7 @@ from hector_jax.control.controller import plan_horizon, walk_config
 from hector_jax.control.footstep import Feet
 from hector_jax.control.gait import GaitConfig, gait_named
 from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.weights import (
-    direction_names,
-    expert,
-    nominal,
-    weight_names,
-)
+from hector_jax.control.weights import direction_names, expert, nominal, weight_names
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, Wrench
@@ -148,7 +143,7 @@ def test_a_net_of_four_feet_is_fitted_stored_and_read(tmp_path, data, variant, n
     assert name == variant
     jax.tree.map(np.testing.assert_array_equal, again, params)
     window = jax.tree.map(lambda x: jnp.asarray(x[7]), data.window)
-    effect = as_effect(params)(window)
+    effect = jax.jit(as_effect(params))(window)
     assert effect.wrench.force.shape == effect.wrench.moment.shape == (4, 3)
     assert np.any(effect.wrench.force)
     assert not np.any(effect.wrench.moment)

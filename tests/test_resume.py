@@ -229,13 +229,10 @@ def test_a_run_whose_data_are_elsewhere_is_refused_at_once(begun, tmp_path, monk
     ("changed", "given", "message"),
     [
         ({}, "--seeds 8", "run: begun with --seeds 3, got 8"),  # the default
-        ({}, "--traj straight", "run: begun with --traj c, got straight"),
-        ({}, "--smooth 3", "run: begun with --smooth 2.0, got 3"),
-        ({}, "--start nominal", "run: begun with --start expert, got nominal"),
         ({}, "--out other", "only one can be given"),
         ({}, "--each", "run: no runs of single trajectories in it; leave out --each"),
-        ({"code": "another"}, "", "run: begun with other code or other versions"),
-        ({"robot": "another"}, "", "run: begun with robot another, here is"),
+        ({"code": "another"}, "", "run: made by other code or other versions"),
+        ({"robot": "another"}, "", "run: made for another robot"),
         (None, "", "run/config.json: cannot read a file of a run of"),
     ],
 )
@@ -255,15 +252,15 @@ def test_another_configuration_is_not_taken_up(begun, changed, given, message):
     ("then", "now", "message"),
     [
         ({"command": {"velocity": 0.3}}, {"command": {"velocity": 0.5}}, "command.velocity 0.3, "),
-        ({"start": {"kp": 0.8}}, {"start": {"kp": 0.9}}, "start.kp 0.8, here is 0.9"),
-        ({"start": {}}, {"start": {"kp": 0.8}}, "a start of other numbers beside Q and R"),
+        ({"start": {"kp": 0.8}}, {"start": {"kp": 0.9}}, "start.kp 0.8, this command expects 0.9"),
+        ({"start": {}}, {"start": {"kp": 0.8}}, "start.kp None, this"),
     ],
 )
 def test_a_run_of_another_trajectory_or_start_is_not_taken_up(begun, then, now, message):
     then, now = {"start": {}} | then, {"start": {}} | now
     noted = run_folder.note_settings(begun, then)
     assert run_folder.note_settings(begun, then) == noted
-    with pytest.raises(InputError, match=f"begun with {message}"):
+    with pytest.raises(InputError, match=f"made with {message}"):
         run_folder.note_settings(begun, now)
 
 

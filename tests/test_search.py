@@ -134,15 +134,21 @@ def test_a_record_of_another_search_or_a_damaged_one_is_refused(tmp_path):
     path = tmp_path / "s.jsonl"
     kept = path.read_bytes()
     for other, says in (
-        ({"config": SearchConfig(60, 10, seed=5)}, r"s\.jsonl: .* its seed is 3, expected 5"),
-        ({"start": expert()}, "its start is"),
-        ({"world": "hfs"}, "its world is bowl"),
+        (
+            {"config": SearchConfig(60, 10, seed=5)},
+            r"s\.jsonl: made with seed 3, this command expects 5",
+        ),
+        ({"start": expert()}, "made with start"),
+        ({"world": "hfs"}, "made with world .bowl"),
     ):
         with pytest.raises(InputError, match=says):
             run(tmp_path, **other)
     assert path.read_bytes() == kept
     lines = kept.splitlines(keepends=True)
-    damaged = {b"{}\n": "line 3 is dam", b'{"steps": [[0]], "losses": [1]}\n': "expected"}
+    damaged = {
+        b"{}\n": "line 3: a row of a search was exp",
+        b'{"steps": [[0]], "losses": [1]}\n': "expected",
+    }
     for row, says in damaged.items():
         path.write_bytes(b"".join([*lines[:2], row, *lines[3:]]))
         with pytest.raises(InputError, match=says):

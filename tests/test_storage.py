@@ -7,8 +7,6 @@ import jax
 import numpy as np
 import pytest
 
-from hector_jax.control.weights import expert, nominal
-from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core import tree_file
 from hector_jax.core.trajectory import Wrench
 from hector_jax.core.tree_file import load_tree, read_card, save_tree, tree_hash
@@ -79,11 +77,3 @@ def test_a_robot_is_known_by_its_numbers_to_nine_digits():
     assert tree_hash(ROBOT) == tree_hash(jax.tree.map(np.copy, ROBOT))
     assert len({tree_hash(robot) for robot in (ROBOT, other, near)}) == 3
     assert tree_hash(ROBOT, 9) == tree_hash(near, 9) != tree_hash(other, 9)
-
-
-def test_weights_come_back_as_they_were_written(tmp_path):
-    path = tmp_path / "weights.json"
-    others = {"friction": np.array(0.3), "kp": np.arange(1.0, 6.0)}
-    for weights in (expert(), nominal()._replace(others=others)):
-        save_weights(path, weights)
-        jax.tree.map(np.testing.assert_array_equal, load_weights(path), weights)

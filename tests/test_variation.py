@@ -16,10 +16,8 @@ from hector_jax.core.trajectory import State, Wrench
 from hector_jax.grfm.effect import ground_effect, last_command
 from hector_jax.robot import srbm
 from hector_jax.robot.description import TuningSettings
-from hector_jax.tuning.difftune import TuneConfig, tune_step
-from hector_jax.tuning.evaluate import evaluate_jit
-from hector_jax.tuning.loss import PAPER_LOSS
-from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout_config, with_variation
+from hector_jax.tuning.loss import PAPER_LOSS, losses, total
+from hector_jax.tuning.rollout import Scenario, rollout, rollout_config, with_variation
 from hector_jax.tuning.variation import (
     drawn_variation,
     estimate_error,
@@ -101,7 +99,7 @@ def test_a_foot_that_slips_keeps_its_direction_and_load():
 
 
 def test_drawn_variations_are_as_robots_differ():
-    config = RolloutConfig().walk
+    config = rollout_config(ROBOT).walk
     drawn = [drawn_variation(config, ROBOT, seed) for seed in range(200)]
     for name, low, high in (
         ("mass", 0.9, 1.1),
@@ -149,10 +147,13 @@ def test_the_description_of_a_robot_states_the_noise_and_the_delay_of_its_tuning
 
 def test_a_tuning_sees_the_noise_and_the_delay_of_the_description():
     config = rollout_config(robot_with(estimate_noise=1.0, delay=0.005), seconds=0.1)
-    without = RolloutConfig(ticks=10)
-    seen = tune_step(TuneConfig(rollout=config), SCENARIO, nominal())
-    told, none = with_variation(config, SCENARIO), SCENARIO._replace(variation=BELIEVED)
-    assert_same(seen, evaluate_jit(without, told, nominal(), PAPER_LOSS))
-    plain, as_plain = (evaluate_jit(without, s, nominal(), PAPER_LOSS) for s in (SCENARIO, none))
-    assert float(as_plain.loss) == pytest.approx(float(plain.loss), rel=1e-9)
-    assert 1e-3 < abs(seen.loss / plain.loss - 1.0) < 0.5
+    without = rollout_config(ROBOT, seconds=0.1)
+    walk = partial(jax.jit(rollout, static_argnums=0), weights=nominal())
+    seen, told = walk(config, SCENARIO), with_variation(config, SCENARIO)
+    assert_same(seen, walk(without, told))
+    plain, as_plain = (walk(without, SCENARIO._replace(variation=v)) for v in (None, BELIEVED))
+    loss, loss_as_plain, loss_seen = (
+        float(total(PAPER_LOSS, losses(PAPER_LOSS, x))) for x in (plain, as_plain, seen)
+    )
+    assert loss_as_plain == pytest.approx(loss, rel=1e-9)
+    assert 1e-3 < abs(loss_seen / loss - 1.0) < 0.5

@@ -17,6 +17,7 @@ from hector_jax.control.weights import expert, nominal, weights_to_vector
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core import inputs
 from hector_jax.core.files import write_json
+from hector_jax.core.journal import write_rows
 from hector_jax.report import pictures
 from hector_jax.report.motion import motion
 from hector_jax.report.view import ViewedWalk, arrows
@@ -46,12 +47,12 @@ def pretend_run(folder):
 
 
 def write_metrics(folder, iterations, refused=()):
-    lines = [
-        runs.as_line(name, iteration)
+    rows = [
+        runs.as_row(name, iteration)
         for name, pace in (("without", 5.0), ("with", 3.0))
         for iteration in pretend_history(iterations, pace, refused)
     ]
-    (folder / "metrics.jsonl").write_text("".join(lines))
+    write_rows(folder / "metrics.jsonl", rows)
 
 
 @pytest.mark.parametrize("size", [1.0, 2.0])
@@ -92,8 +93,9 @@ def test_metrics_of_a_run_that_goes_on_are_read_and_its_newest_weights_taken(tmp
     run = pretend_run(tmp_path)
     write_metrics(run, 6, refused=(3,))
     found = runs.read_histories(run)
-    again = [runs.as_line(name, i) for name, history in found.items() for i in history]
-    assert "".join(again) == (run / "metrics.jsonl").read_text()
+    again = [runs.as_row(name, i) for name, history in found.items() for i in history]
+    write_rows(tmp_path / "again", again)
+    assert (tmp_path / "again").read_bytes() == (run / "metrics.jsonl").read_bytes()
     assert [i.accepted for i in found["with"]] == [k != 3 for k in range(7)]
     curve = runs.loss_curves(found)["with"]
     assert np.isnan(curve[3])

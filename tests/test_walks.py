@@ -113,9 +113,9 @@ def test_any_engine_walks_and_is_recorded(robot, in_process, tmp_path):
     score, _ = walks.walk_case(one, nominal(robot), 0)
     assert len(jobs) == 1
     assert score.loss == in_process[2][0].losses[0]
-    walks.read_history(one)
-    with pytest.raises(InputError, match="its engine is mine"):
-        walks.read_history(replace(one, engine=MUJOCO_C))
+    walks.read_record(one)
+    with pytest.raises(InputError, match="made with engine .mine"):
+        walks.read_record(replace(one, engine=MUJOCO_C))
 
 
 def test_the_plain_model_is_not_grounded(robot, pool, in_process):
@@ -131,8 +131,8 @@ def test_the_plain_model_is_not_grounded(robot, pool, in_process):
 
 def test_the_record_of_another_tuning_is_refused(robot, in_process):
     one = replace(in_process[0], seed=1)
-    with pytest.raises(InputError, match=r"its seed is 0, expected 1"):
-        walks.read_history(one)
+    with pytest.raises(InputError, match=r"made with seed 0, this command expects 1"):
+        walks.read_record(one)
 
 
 def test_a_start_that_falls_is_refused(robot, pool, in_process, tmp_path):

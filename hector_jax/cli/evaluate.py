@@ -23,7 +23,6 @@ from hector_jax.core.trajectory import SOLVED
 from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import save_tree
 from hector_jax.grfm import training
-from hector_jax.grfm.collection import Walks
 from hector_jax.grfm.dataset import at_interval, make_dataset
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect
@@ -35,6 +34,7 @@ from hector_jax.sim.diagnosis import Fall, fall_of
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.store import nets, tunings
+from hector_jax.store.collection import Walks
 from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import Loss, loss_of_robot

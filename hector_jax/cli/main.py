@@ -10,7 +10,6 @@ import json
 import logging
 import sys
 import warnings
-from collections.abc import Sequence
 from functools import cache, partial
 
 from hector_jax.core.inputs import InputError, outside_packages
@@ -26,13 +25,8 @@ except InputError as error:
     sys.exit(2)
 
 
-def main() -> int:
-    """Run the console script and return its exit code."""
-    return exit_code("hector", partial(_run, sys.argv[1:]))
-
-
-def _run(words: Sequence[str]) -> None:
-    args = resolve_latest(from_line(words))
+def _run() -> None:
+    args = resolve_latest(from_line(sys.argv[1:]))
     check_flags(args)
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # hides messages about its cache
     say_once = cache(say)  # MuJoCo repeats what it finds in a robot's file each time it reads it
@@ -50,6 +44,9 @@ def _run(words: Sequence[str]) -> None:
         raise Broken(str(error)) from None
     commands.run(args)
 
+
+main = partial(exit_code, "hector", _run)
+"""Run the console script and return its exit code."""
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -67,8 +67,9 @@ def run_report(args: Report) -> None:
     texts = list(map(str, args.logs))
     files = _files(texts, list(campaign.commands))
     with locked(args.folder), workers(args.processes) as pool:
-        number = len(walks.read_history(campaign))
-        if (proposal := walks.pending(campaign, number)) is None:
+        before, proposal = walks.read_record(campaign)
+        number = len(before)
+        if proposal is None:
             raise InputError(f"{args.folder}: no walk is waited for; begin with hector propose")
         named = [name for name, _ in map(named_file, texts)]
         tracked = _check_logs(campaign, number, files, named)
@@ -122,8 +123,10 @@ def _check_logs(
     The user said of which trajectory the `named` ones are.
     """
     robot, path = campaign.robot, walks.weights_path(campaign.folder, number)
-    walked = load_weights(path, robot), robot, campaign.seconds
-    proposed = {n: walk_log.walk_card(n, x, *walked) for n, x in campaign.commands.items()}
+    weights, seconds = load_weights(path, robot), campaign.seconds
+    proposed = {
+        n: walk_log.walk_card(n, x, weights, robot, seconds) for n, x in campaign.commands.items()
+    }
     result, before = {}, [p for n in range(number) for p in walks.log_paths(campaign, n)]
     for name, file in files.items():
         tick = campaign.config.rollout.walk.gait.tick

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -18,6 +18,7 @@ from hector_jax.control.trajectories import NamedCommand
 from hector_jax.core.environment import code_hash, environment
 from hector_jax.core.files import as_json, make_folder, write_json
 from hector_jax.core.inputs import InputError, plural
+from hector_jax.core.journal import check_settings
 from hector_jax.core.settings import convert
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.store.cache import robot_hash
@@ -27,6 +28,7 @@ from hector_jax.walk_tuning.campaign import with_leg_numbers
 
 F = TypeVar("F", bound=Flags)
 
+_REMEDY = "start a new run"
 TIME = "%Y%m%d-%H%M%S"  # names a run
 _CODE = (*COLLECTION_CODE, "grfm.training", "sim.standin", "verdict.choice", "walk_tuning.walks")
 # flags of a call, not of the run that it begins or resumes
@@ -130,13 +132,9 @@ def resume(folder: Path, args: Tune) -> Tune:
     for name in ("robot", "code", "directory"):
         convert(config.get(name), str, name=f"{path}: {name}")
     begun = from_file(Tune, path)
-    if config["code"] != code_hash(*_CODE):
-        commit = made_with.get("commit", "no commit is noted")
-        raise InputError(
-            f"{folder}: begun with other code or other versions of its packages ({commit}); "
-            "start a new run"
-        )
-    check_agreement(folder, config, {"robot": robot_hash(load_robot(begun.robot))})
+    now = {"code": code_hash(*_CODE), "robot": robot_hash(load_robot(begun.robot))}
+    commit = made_with.get("commit", "no commit is noted")
+    check_settings(folder, {name: config[name] for name in now}, now, f"{_REMEDY} ({commit})")
     flags = merge_flags(folder, begun, args, call_flags=_CALL_FLAGS)
     data = arguments.data_folder(flags.data, flags.robot, load_robot(flags.robot))
     if (
@@ -177,18 +175,6 @@ def merge_flags(folder: Path, begun: F, args: F, call_flags: Sequence[str]) -> F
     return replace(args, **flags)
 
 
-def check_agreement(folder: Path, recorded: Mapping[str, Any], current: Mapping[str, Any]) -> None:
-    """Compare the settings of a run with those recorded when it was begun.
-
-    Raises:
-        InputError: one line naming the folder and the first setting that differs.
-    """
-    old = flattened(recorded)
-    for name, value in flattened(current).items():
-        if old.get(name, value) != value:
-            raise InputError(f"{folder}: begun with {name} {old[name]}, here is {value}")
-
-
 def note_settings(folder: Path, settings: dict[str, Any]) -> dict[str, Any]:
     """Add resolved settings to config.json and return all that is in it.
 
@@ -197,9 +183,8 @@ def note_settings(folder: Path, settings: dict[str, Any]) -> dict[str, Any]:
     """
     path = folder / CONFIG
     recorded, as_read = read_object(path), json.loads(as_json(settings))
-    check_agreement(folder, recorded, as_read)
-    if recorded.get("start", as_read["start"]) != as_read["start"]:  # a number added or removed
-        raise InputError(f"{folder}: begun with a start of other numbers beside Q and R")
+    if before := {name: recorded[name] for name in as_read if name in recorded}:
+        check_settings(folder, flattened(before), flattened(as_read), _REMEDY)
     write_json(path, recorded | settings)
     return recorded | settings
 

@@ -1,7 +1,7 @@
 """`hector tune`: tune weights with and without the net, evaluate them, and write a run folder."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -75,19 +75,18 @@ def run_tune(args: Tune) -> None:
 
 
 class _Run(NamedTuple):
-    """Shared inputs of the steps of a run."""
+    """Inputs of the steps of a run."""
 
     setup: Setup
     folder: Path
     args: Tune
     start: Weights
     trajectories: tuple[NamedCommand, ...]
-    net: nets.TrainedNet
 
     @property
     def settings_of_best(self) -> tuple[TuneConfig, Weights]:
         """Settings and start of the tuning of `best`."""
-        _, config, robot, _ = self.setup
+        _, config, robot = self.setup
         smooth, safe = self.args.smooth, self.args.safe
         return choice.settings_of_best(config, robot, self.start, smooth=smooth, safe=safe)
 
@@ -106,17 +105,17 @@ class _Run(NamedTuple):
         """Commands by the names of the trajectories."""
         return {trajectory.name: trajectory.command for trajectory in self.trajectories}
 
-    @property
-    def problems(self) -> dict[str, tunings.Problem]:
+    def problems(self, net: nets.TrainedNet) -> dict[str, tunings.Problem]:
         """Tuning problems of all trajectories, without and with the net."""
         commands = tuple(self.commands.values())
-        params = {"without": None, "with": self.net.params}
+        params = {"without": None, "with": net.params}
         return {name: tunings.Problem(commands, net) for name, net in params.items()}
 
 
 class _Tuned(NamedTuple):
     """Results of the tunings of a run."""
 
+    net: nets.TrainedNet
     tunings: dict[str, Tuning]
     sets: dict[str, Weights]
     chosen: str  # "iteration 5", the one of its tuning that is `best`
@@ -124,32 +123,14 @@ class _Tuned(NamedTuple):
     best_proposal: str  # "set 3", the one that is `best` in place of it; empty without
 
 
-def _begin(pool: Executor, folder: Path, args: Tune, commit: str) -> _Run:
-    """Read what the flags name, compile the programs and make or load the net."""
+def _begin(pool: Executor, folder: Path, args: Tune) -> _Run:
+    """Read what the flags name, but the net."""
     robot = load_robot(args.robot)
     trajectories = run_folder.trajectories(args, robot)
     config = tunings.tune_config(robot, iterations=args.iterations, others=model_numbers(args.tune))
     config = arguments.with_length(config, trajectories[0])
     start = arguments.weights_by_name(args.start, robot)
-    data = arguments.data_folder(args.data, args.robot, robot)
-    net = nets.load_trained(args.net, robot, args.variant)[0] if args.net else None
-    setup = Setup(pool, config, robot, commit)
-    hfs_folder = folder / _ARTEFACTS / "hfs"
-    check = partial(_check_start, setup, args.start, start, trajectories, hfs_folder)
-    config_of_best, start_of_best = choice.settings_of_best(
-        config, robot, start, smooth=args.smooth, safe=args.safe
-    )
-    one_command = tunings.Problem((trajectories[0].command,), None, 1)
-    for line in tunings.compile_programs(
-        setup,
-        start,
-        trajectories[0],
-        others=[(config_of_best, start_of_best, one_command)],
-        meanwhile=check,
-    ):
-        say(f"before any tuning, {trajectories[0].name} on hfs: {line}")
-    net = net or nets.load_or_train(pool, robot, data, args.variant)
-    return _Run(setup, folder, args, start, trajectories, net)
+    return _Run(Setup(pool, config, robot), folder, args, start, trajectories)
 
 
 def _with_aligned_loss(run: _Run, norms: Mapping[str, float]) -> _Run:
@@ -164,14 +145,27 @@ def _tune_in(folder: Path, args: Tune) -> None:
     """Execute a run, reusing the results already in its folder."""
     start_time, made_with = time.monotonic(), environment()
     with workers(args.processes) as pool:
-        run = _begin(pool, folder, args, made_with.get("commit", ""))
-        norms = tunings.mean_norms(run.setup, run.problems)
+        run = _begin(pool, folder, args)
+        robot, first = run.setup.robot, run.trajectories[0]
+        given = nets.load_trained(args.net, robot, args.variant)[0] if args.net else None
+        for line in tunings.compile_programs(
+            run.setup,
+            run.start,
+            first,
+            others=[(*run.settings_of_best, tunings.Problem((first.command,), None, 1))],
+            meanwhile=partial(_check_start, run),
+        ):
+            say(f"before any tuning, {first.name} on hfs: {line}")
+        data = arguments.data_folder(args.data, args.robot, robot)
+        net = given or nets.load_or_train(pool, robot, data, args.variant)
+        norms = tunings.mean_norms(
+            run.setup, {n: run.problems(net)[n] for n in ("without", "with")}
+        )
         if args.alpha == "auto":
             run = _with_aligned_loss(run, norms["with"])
-        settings = _note_settings(run)
-        tuned = _tune_sets(run)
-        walks = _walk_sets(run, tuned.sets)
-        first, elsewhere = run.trajectories[0], folder / _ARTEFACTS / "elsewhere"
+        settings = _note_settings(run, net)
+        tuned = _tune_sets(run, net)
+        walks, elsewhere = _walk_sets(run, tuned.sets), folder / _ARTEFACTS / "elsewhere"
         show = None
         if args.verdict:
             show = small_verdict(run.setup, tuned.sets, first, run.seconds, elsewhere)
@@ -179,7 +173,6 @@ def _tune_in(folder: Path, args: Tune) -> None:
     known = determined(precision, config.ridge, step_names(run.start, config.others))
     result, by_name = _result(run, tuned, walks, known)
     write_json(folder / VERSIONS, made_with | {"seconds": f"{time.monotonic() - start_time:.0f}"})
-    name_of_run = "latest" if Path("runs").resolve() in folder.resolve().parents else str(folder)
     report = write_run_report(
         folder,
         run=str(folder),
@@ -187,7 +180,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         verdict=by_name[run.name],
         norms=norms,
         determined=known,
-        errors=run.net.errors,
+        errors=net.errors,
         tunings=tuned.tunings,
         proposals=changes_by_walk(tuned.proposals),
         best_proposal=tuned.best_proposal,
@@ -200,31 +193,43 @@ def _tune_in(folder: Path, args: Tune) -> None:
         environment=made_with,
         command=as_command("hector tune", run_folder.run_flags(args)),
     )
-
-    def print_text() -> None:
-        print(*first_lines(by_name[run.name], name_of_run), "", sep="\n")
-        for name, verdict in by_name.items():
-            print_table(verdict, f"{name}, {plural(args.seeds, 'plant')}")
-        if show:
-            show()
-
-    print_result(args.json, {"run": str(folder), "traj": run.name, **result}, print_text)
+    _print(run, result, by_name, show)
     say(f"the report is {report}")
 
 
-def _check_start(
-    setup: Setup, text: str, start: Weights, trajectories: Sequence[NamedCommand], folder: Path
+def _print(
+    run: _Run,
+    result: Mapping[str, Any],
+    by_name: Mapping[str, metrics.Verdict],
+    show_elsewhere: Callable[[], None] | None,
 ) -> None:
+    """Print the result of a run."""
+    in_runs = Path("runs").resolve() in run.folder.resolve().parents
+
+    def print_text() -> None:
+        print(
+            *first_lines(by_name[run.name], "latest" if in_runs else str(run.folder)), "", sep="\n"
+        )
+        for name, verdict in by_name.items():
+            print_table(verdict, f"{name}, {plural(run.args.seeds, 'plant')}")
+        if show_elsewhere:
+            show_elsewhere()
+
+    print_result(run.args.json, {"run": str(run.folder), "traj": run.name, **result}, print_text)
+
+
+def _check_start(run: _Run) -> None:
     """Walk with the weights at the start on the hfs; `_walk_sets` reads these walks again.
 
     Raises:
         InputError: the robot falls; the line has the likeliest cause and what to change.
     """
-    robot, case = setup.robot, (text if text in BASELINES else "start", 0)
-    for name, command, seconds in trajectories:
-        job = Job(start, command, hfs(robot.description), seconds or Walk.seconds)
-        options = {"title": f"walking {name} with the weights to start from", "folder": folder}
-        walks = judging.score_jobs(setup, {case: job}, **options, with_walk=[case])
+    setup, robot, text = run.setup, run.setup.robot, run.args.start
+    case, folder = (text if text in BASELINES else "start", 0), run.folder / _ARTEFACTS / "hfs"
+    for name, command in run.commands.items():
+        job = Job(run.start, command, hfs(robot.description), run.seconds)
+        title = f"walking {name} with the weights to start from"
+        walks = judging.score_jobs(setup, {case: job}, title=title, folder=folder, with_walk=[case])
         if walks[case][0].score.fallen:
             body, host_job = jax.tree.map(np.asarray, robot), on_host(job)
             falling = setup.pool.submit(fall_of, setup.config.rollout.walk, body, host_job)
@@ -233,13 +238,13 @@ def _check_start(
             raise InputError(f"--start {text} cannot be tuned from: {where} {fall}")
 
 
-def _note_settings(run: _Run) -> dict[str, Any]:
+def _note_settings(run: _Run, net: nets.TrainedNet) -> dict[str, Any]:
     """Add the resolved settings to config.json; InputError if they differ from those recorded."""
     as_lists = partial(jax.tree.map, lambda x: np.asarray(x).tolist())
     commands = [as_lists(command)._asdict() for command in run.commands.values()]
     settings = {
         "tune": run.setup.config.as_table(),
-        "net": tree_hash(run.net.params),
+        "net": tree_hash(net.params),
         "command": commands[0] if len(commands) == 1 else commands,
         "seconds": run.seconds,
         "start": weights_tree(run.start),
@@ -248,28 +253,27 @@ def _note_settings(run: _Run) -> dict[str, Any]:
     return run_folder.note_settings(run.folder, settings)
 
 
-def _tune_sets(run: _Run) -> _Tuned:
+def _tune_sets(run: _Run, net: nets.TrainedNet) -> _Tuned:
     """Tune without and with the net; write the weights."""
     setup, commands = run.setup, list(run.commands.values())
-    config, start = run.settings_of_best
-    problem = {"best": tunings.Problem(tuple(commands), run.net.params, choice.DRAWS)}
-    folder = run.folder / _ARTEFACTS
+    problems, folder = run.problems(net), run.folder / _ARTEFACTS
     tune_in = partial(tunings.tune_all, folder=folder, metrics=run.folder / METRICS)
     title = f"tuning {run.name} without and with GRFM-Net"
-    done = tune_in(setup, run.problems, title=title, start=run.start)
-    for_best = setup._replace(config=config)
+    done = tune_in(setup, problems, title=title, start=run.start)
     models = plural(choice.DRAWS * len(commands), "drawn model")
     title = f"tuning {run.name} on {models}, for `best`"
-    done |= tune_in(for_best, problem, title=title, start=start, before=done)
-    results = {name: entry.tuning for name, entry in done.items()}
+    config, start = run.settings_of_best
+    problem = {"best": problems["with"]._replace(draws=choice.DRAWS)}
+    of_best = setup._replace(config=config)
+    done |= tune_in(of_best, problem, title=title, start=start, before=done)
     options = {"seconds": run.seconds, "folder": folder / "choice"}
-    points, plants = choice.points_of(results["best"]), setup.robot.description.tuning.choice_plants
+    points, plants = choice.points_of(done["best"]), setup.robot.description.tuning.choice_plants
     chosen = choice.walks_best(setup, points, commands, plants, **options)
     sets = {
         "nominal": nominal(setup.robot),
         "expert": expert(setup.robot),
         **({} if run.args.start in BASELINES else {"start": run.start}),
-        **{name: tuning.weights for name, tuning in results.items()},
+        **{name: tuning.weights for name, tuning in done.items()},
         "best": points[chosen],
     }
     proposals, best = [], ""
@@ -283,7 +287,7 @@ def _tune_sets(run: _Run) -> _Tuned:
         sets["best"] = stages[best]
     for name, weights in sets.items():
         save_weights(run.folder / "weights" / f"{name}.json", weights)
-    return _Tuned(results, sets, chosen, proposals, best)
+    return _Tuned(net, done, sets, chosen, proposals, best)
 
 
 def _campaign(run: _Run, start: Weights) -> Campaign:
@@ -310,17 +314,13 @@ def _walk_sets(
     seeds, description = range(run.args.seeds), run.setup.robot.description
     plants = arguments.plants("standin", seeds, description)
     judge = partial(judging.judge, run.setup, sets, seconds=run.seconds)
-    simulator, walks = hfs(description), {}
+    folder, simulator, walks = run.folder / _ARTEFACTS, hfs(description), {}
     for name, command in run.commands.items():
         suffix = f" {name}" if len(run.trajectories) > 1 else ""
         title = f"evaluating{suffix} on {plural(len(seeds), 'stand-in plant')}"
-        standin = judge(
-            command, plants, seeds, title=title, folder=run.folder / _ARTEFACTS / "standin"
-        )
+        standin = judge(command, plants, seeds, title=title, folder=folder / "standin")
         title = f"walking{suffix} on the high-fidelity simulator"
-        on_hfs = judge(
-            command, [simulator], [0], title=title, folder=run.folder / _ARTEFACTS / "hfs"
-        )
+        on_hfs = judge(command, [simulator], [0], title=title, folder=folder / "hfs")
         walks[name] = standin, on_hfs
         _say_worse(name, on_hfs)
     return walks
@@ -374,7 +374,7 @@ def _result(
 
 def _draw(run: _Run, tuned: _Tuned, standin: ScoredWalks, on_hfs: ScoredWalks) -> dict[str, Any]:
     """Draw the pictures and the film of a run, for its report."""
-    effects = {"linear": as_effect(run.net.linear), "residual": as_effect(run.net.params)}
+    effects = {"linear": as_effect(tuned.net.linear), "residual": as_effect(tuned.net.params)}
     with ThreadPoolExecutor(1) as background:  # another process draws the film
         film = background.submit(_film, run, standin)
         curves = fidelity.curves(run.setup.robot, on_hfs.first["nominal"], effects)
@@ -385,7 +385,7 @@ def _draw(run: _Run, tuned: _Tuned, standin: ScoredWalks, on_hfs: ScoredWalks) -
             tunings=tuned.tunings,
             walks=standin.first,
             ground=curves,
-            training=run.net.history,
+            training=tuned.net.history,
         )
     return {"pictures": drawings, "film": film.result()}
 

@@ -64,7 +64,7 @@ def run_verdict(args: Verdict) -> None:
     make_folder(args.out)
     made_with, config = environment(), tunings.tune_config(plan.robot)
     with workers(args.processes) as pool:
-        setup = Setup(pool, config, plan.robot, made_with.get("commit", ""))
+        setup = Setup(pool, config, plan.robot)
         cells = walk_cells(setup, plan, args.out / "scores")
     result = report.write_verdict_report(
         args.out,

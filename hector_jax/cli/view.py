@@ -64,7 +64,9 @@ def run_view(args: View) -> None:
 
     def motions() -> tuple[dict[str, Motion], str]:
         walks, description = walk()
-        return titled({name: motion(robot, *viewed) for name, viewed in walks.items()}), description
+        return titled(
+            {name: motion(robot, v.walk, v.ground) for name, v in walks.items()}
+        ), description
 
     if folder is not None:
         histories = read_histories(args.run)

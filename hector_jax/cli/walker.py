@@ -13,7 +13,6 @@ from hector_jax.cli.flags import Check, Tune, Twin
 from hector_jax.control.controller import walk_config
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.console import say
-from hector_jax.core.environment import environment
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
@@ -101,7 +100,7 @@ def tune_walker(folder: Path, args: Tune) -> None:
     Whether the start stays `best` is decided on plants that were not walked, and the table is of
     others again.
     """
-    robot, made_with = load_robot(args.robot), environment()
+    robot = load_robot(args.robot)
     trajectories = run_folder.trajectories(args, robot)
     config = arguments.with_length(tunings.tune_config(robot), trajectories[0])
     seconds = config.rollout.ticks * config.rollout.walk.gait.tick
@@ -119,7 +118,7 @@ def tune_walker(folder: Path, args: Tune) -> None:
         rows = tune_on_walks(pool, campaign, args.walks)
         weights, number = answer(campaign, campaign_space(pool, campaign), rows)
         sets, commands = {"set 0": campaign.start, f"set {number}": weights}, campaign.commands
-        setup = Setup(pool, config, robot, made_with.get("commit", ""))
+        setup = Setup(pool, config, robot)
         options = {"seconds": seconds, "folder": folder / "scores", "engine": campaign.engine}
         chosen = choice.walks_best(setup, sets, [*commands.values()], choice.HELD_OUT, **options)
         compared = {"start": sets["set 0"], "best": sets[chosen]}

@@ -25,7 +25,8 @@ class WriteError(Broken):
     """A file cannot be written, for example on a full disk; the message names it."""
 
 
-def _cannot_write(path: Path, error: OSError) -> WriteError:
+def cannot_write(path: Path, error: OSError) -> WriteError:
+    """Return the error for a file that cannot be written."""
     # files are complete, and a run continues from them
     return WriteError(f"cannot write {path}: {error.strerror}; what was written before it is kept")
 
@@ -55,25 +56,10 @@ def write_file(path: Path, data: bytes) -> None:
         finally:
             os.close(folder)
     except OSError as error:
-        raise _cannot_write(path, error) from error
+        raise cannot_write(path, error) from error
     finally:
         with suppress(OSError):
             part.unlink()  # still there after an error
-
-
-def append_file(path: Path, data: bytes) -> None:
-    """Append `data` to a file; an interruption may leave part of it.
-
-    Raises:
-        WriteError: one line with the path, if the folder or the disk cannot be written.
-    """
-    try:
-        with Path(path).open("ab") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise _cannot_write(path, error) from error
 
 
 def make_folder(folder: Path) -> None:
@@ -94,14 +80,14 @@ def make_folder(folder: Path) -> None:
 def locked(folder: Path) -> Iterator[None]:
     """Create `folder` and lock it against other writers for the duration of the block.
 
-    Waits, with a line on stderr, for another process that holds the lock. A killed process releases
-    it; files that its `write_file` left incomplete are removed here.
+    The block may lock it again. Waits, with a line on stderr, for another process that holds the
+    lock. A killed process releases it; files that its `write_file` left incomplete are removed.
 
     Raises:
         InputError: one line with the folder that cannot be created or written.
     """
     make_folder(folder)
-    lock = FileLock(Path(folder) / ".lock")
+    lock = FileLock(Path(folder).resolve() / ".lock", is_singleton=True)
     try:
         lock.acquire(blocking=False)
     except Timeout:

@@ -103,8 +103,7 @@ def from_start(walk: Trajectory) -> Trajectory:
 
     def transform(state: State) -> State:
         position = (state.position - origin) @ R
-        rates = state.ang_velocity @ R, state.velocity @ R
-        return State(state.euler - yaw, position, *rates)
+        return State(state.euler - yaw, position, state.ang_velocity @ R, state.velocity @ R)
 
     return walk._replace(
         initial=transform(walk.initial),

@@ -24,7 +24,6 @@ from hector_jax.core.inputs import InputError, one_line, short_repr
 
 FORMAT = 1
 ROBOT_DIGITS = 9  # of a robot's numbers; rounding on another machine gives the same hash
-OTHER_CODE = "by other code or other versions of jax, jaxlib, mujoco or another package"
 _SHA256 = 64  # hexadecimal digits
 
 Tree = TypeVar("Tree")
@@ -152,23 +151,3 @@ def named_leaves(tree: Any) -> dict[str, Any]:
     """Return the leaves of a tree by their names in a file, such as `state.euler`."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
-
-
-def check_settings(path: Path, made: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    """Check that the settings recorded in a file or folder equal those of the current command.
-
-    Raises:
-        InputError: one line naming the file and the first setting that differs.
-    """
-    for name in {**expected, **made}:
-        before, now = made.get(name), expected.get(name)
-        if before == now:
-            continue
-        what = f"with {name} {short_repr(before)}, this command expects {short_repr(now)}"
-        if name == "robot":
-            what = (
-                "for another robot of this name (`name` in its TOML), or before its files changed"
-            )
-        if name == "code":
-            what = OTHER_CODE
-        raise InputError(f"{path}: made {what}; remove it, or name another folder")

@@ -184,8 +184,8 @@ def _samples(
     begin, end = config.gait.tick * tick[:, None], config.gait.tick * (tick[:, None] + 1)
     pushed = (push.start < end) & (push.start + push.duration > begin) & push.force.any(axis=-1)
     usable = jnp.stack([~current.fallen, solved, ~pushed.any(axis=1), *finite]).all(axis=0)
-    same = jnp.full_like(tick, number), tick, jnp.full_like(tick, has_moments, dtype=bool)
-    return Dataset(window, label, legs, error, lands, previous, *same), usable
+    walk, moments = jnp.full_like(tick, number), jnp.full_like(tick, has_moments, dtype=bool)
+    return Dataset(window, label, legs, error, lands, previous, walk, tick, moments), usable
 
 
 def _planned_touchdowns(

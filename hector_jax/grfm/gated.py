@@ -138,8 +138,8 @@ def hats(time: Float[Array, "*batch"], knots: Float[Array, " knots"]) -> Float[A
     before = jnp.concatenate([knots[:1] - 1.0, knots[:-1]])
     after = jnp.concatenate([knots[1:], knots[-1:] + 1.0])
     time = jnp.clip(time, knots[0], knots[-1])[..., None]
-    sides = (time - before) / (knots - before), (after - time) / (after - knots)
-    return jnp.clip(jnp.minimum(*sides), 0.0, 1.0)
+    rising, falling = (time - before) / (knots - before), (after - time) / (after - knots)
+    return jnp.clip(jnp.minimum(rising, falling), 0.0, 1.0)
 
 
 def from_views(values: Float[Array, "feet axes"]) -> Wrench:

@@ -58,7 +58,7 @@ def find_soles(survey: Survey, angles: Mapping[str, float] | None = None) -> tup
     data = data_at(survey.model, angles)
     axes, origins = [_axes(data, leg) for leg in survey.legs], _origins(data, survey.legs)
     feet = list(zip(survey.legs, origins, axes, strict=True))
-    points = [_floor_points(data, *foot) for foot in feet]
+    points = [_floor_points(data, leg, origin, axis) for leg, origin, axis in feet]
     guessed = not all(map(len, points))
     if guessed:
         points = [_inertia_box(data, leg) - origin for leg, origin, _ in feet]

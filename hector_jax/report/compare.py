@@ -122,8 +122,8 @@ def _cells(name: str, verdict: Mapping[str, Any]) -> dict[str, str]:
     for baseline in BASELINES:
         if change := verdict["change"].get(baseline):
             # null if there is no interval
-            ends = (math.nan if change[key] is None else change[key] for key in ("low", "high"))
-            text = Interval(change["median"], *ends).text()
+            low, high = (math.nan if change[k] is None else change[k] for k in ("low", "high"))
+            text = Interval(change["median"], low, high).text()
             cells[f"  against {baseline} [%]"] = text + VOID * (not change["counts"])
     if "L_ctrl" in verdict:  # a loss of one's own may be without
         cells["  L_ctrl [1e6]"] = f"{verdict['L_ctrl']['mean'] / 1e6:.3f}"

@@ -216,8 +216,8 @@ def _closed_form_inverse(
     thigh, shin = -origin[3, 2], -origin[4, 2]
     cos_knee = (x**2 + z**2 - thigh**2 - shin**2) / (2 * thigh * shin)
     # the limits keep both ends away from +-1, where the derivative of arccos is infinite
-    ends = jnp.cos(leg.lower[3]), jnp.cos(leg.upper[3])
-    bend = jnp.arccos(jnp.clip(cos_knee, jnp.minimum(*ends), jnp.maximum(*ends)))
+    low, high = jnp.cos(leg.lower[3]), jnp.cos(leg.upper[3])
+    bend = jnp.arccos(jnp.clip(cos_knee, jnp.minimum(low, high), jnp.maximum(low, high)))
     knee = jnp.where(leg.lower[3] < 0.0, -bend, bend)
     hip = jnp.arctan2(-x, -z) - jnp.arctan2(shin * jnp.sin(knee), thigh + shin * jnp.cos(knee))
     return jnp.stack([yaw, roll, hip, knee, pitch - hip - knee])

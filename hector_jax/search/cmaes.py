@@ -11,12 +11,10 @@ population and seed. On a machine whose linear algebra rounds differently the se
 all losses of the journal, with other draws.
 """
 
-import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -25,13 +23,11 @@ from jaxtyping import Float
 from hector_jax.control.parameters import Q, R, bounds, step_bounds, weights_after
 from hector_jax.control.weights import Weights, direction_names, weights_to_vector
 from hector_jax.control.weights_file import weights_tree
-from hector_jax.core.files import append_file, as_json, write_file
 from hector_jax.core.inputs import InputError, require_package
+from hector_jax.core.journal import add_row, continue_journal
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, Range, check
-from hector_jax.core.tree_file import OTHER_CODE
 
 FORMAT = 1
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -117,7 +113,7 @@ def search(
         }
         if search.start.others:
             head["others"] = weights_tree(search.start)["others"]
-        history = read_journal(paths[name], head, what="search", parse=search.parse)
+        history = continue_journal(paths[name], head, "a search", search.parse)
         for generation in history[: config.generations]:
             search.ask()  # repeats the draws of that generation
             search.tell(generation)
@@ -191,10 +187,11 @@ class CmaSearch:
 
     def parse(self, row: Mapping[str, Any]) -> Generation:
         """Return the generation of a row of the journal; ValueError if its size is wrong."""
-        generation, size = to_generation(row["steps"], row["losses"]), self.config.population
-        expected = (size, len(direction_names(self.start))), (size,)
-        if (got := tuple(x.shape for x in generation)) != expected:
-            raise ValueError("steps {} and losses {}, expected {} and {}".format(*got, *expected))
+        steps, losses = generation = to_generation(row["steps"], row["losses"])
+        size, count = self.config.population, len(direction_names(self.start))
+        if (steps.shape, losses.shape) != ((size, count), (size,)):
+            got = f"{steps.shape} and losses {losses.shape}"
+            raise ValueError(f"steps {got}, expected {(size, count)} and {(size,)}")
         return generation
 
 
@@ -218,57 +215,3 @@ def checked_bounds(start: Weights, others: Sequence[str] = ()) -> Float[np.ndarr
         box = ", ".join(f"{n} {x.lower:g} to {x.upper:g}" for n, x in {"Q": Q, "R": R}.items())
         raise InputError(f"the start lies outside the box of weights: {box}")
     return np.stack(step_bounds(start, others), axis=1)
-
-
-def read_journal(
-    path: Path, head: Mapping[str, Any], *, what: str, parse: Callable[[Any], T], hint: str = ""
-) -> list[T]:
-    """Read the rows of a journal of JSON lines after its settings; create the file if missing.
-
-    An incomplete last line is dropped from the file.
-
-    Args:
-        path: of the journal.
-        head: settings that its first line must have.
-        what: kind of the journal, for error messages.
-        parse: converts a line's value to a row; ValueError, TypeError or KeyError if damaged.
-        hint: what to do if the settings are others, after "choose another folder".
-
-    Raises:
-        InputError: the file is no journal, has other settings, or is damaged.
-        WriteError: the file cannot be written.
-    """
-    if not path.exists():
-        write_file(path, (json.dumps(head, allow_nan=False) + "\n").encode())
-        return []
-    data = path.read_bytes()
-    end = data.rfind(b"\n") + 1
-    first, *lines = data[:end].splitlines() or [b""]
-    try:
-        written = json.loads(first)
-        differs = [name for name in head | written if written.get(name) != head.get(name)]
-    except (ValueError, TypeError) as error:
-        raise InputError(f"{path}: not the record of a {what}: {error}") from error
-    if differs:
-        name = differs[0]
-        got, expected = (str(settings.get(name))[:80] for settings in (written, head))
-        reason = f"its {name} is {got}, expected {expected}"
-        reason = OTHER_CODE if name == "code" else reason
-        raise InputError(f"{path}: record of another {what}: {reason}; choose another folder{hint}")
-    rows = []
-    for number, line in enumerate(lines, 2):
-        try:
-            rows.append(parse(json.loads(line)))
-        except (ValueError, TypeError, KeyError) as error:
-            raise InputError(f"{path}: line {number} is damaged: {error}") from error
-    os.truncate(path, end)
-    return rows
-
-
-def add_row(path: Path, row: Mapping[str, Any]) -> None:
-    """Add a row to a journal; numbers that are not finite become null.
-
-    Raises:
-        WriteError: the file cannot be written.
-    """
-    append_file(path, (as_json(row) + "\n").encode())

@@ -235,8 +235,8 @@ def _walk_blocks(
             packed = planner.plan(packed_constants, np.concatenate(inputs))
             plans.append(np.asarray(packed))
             if torques is None:
-                layouts = planner.layout, layout(state), layout((clock, *measured))
-                torques = _torques(config, of_constants, *layouts)
+                of_inputs = layout((clock, *measured))
+                torques = _torques(config, of_constants, planner.layout, layout(state), of_inputs)
             for _ in range(count):
                 packed_state = torques(packed_constants, packed, packed_state, rows[step])
                 plant.step(np.asarray(packed_state)[:joints], forces[step])

@@ -5,7 +5,6 @@ of code and packages, `metrics.jsonl` a line for each iteration, `weights/` the 
 `result.json` the verdict.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -27,8 +26,8 @@ from hector_jax.control.weights import (
     weights_to_vector,
 )
 from hector_jax.control.weights_file import load_weights
-from hector_jax.core.files import append_file, as_json, write_file
-from hector_jax.core.inputs import InputError, read_text, short_repr
+from hector_jax.core.inputs import InputError, short_repr
+from hector_jax.core.journal import read_rows
 from hector_jax.core.settings import convert, read_json
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.difftune import Iteration
@@ -104,8 +103,8 @@ def read_request(folder: Path) -> RunRequest:
         ) from None
 
 
-def as_line(name: str, iteration: Iteration) -> str:
-    """Format an iteration as a line of metrics.jsonl, for `read_histories`."""
+def as_row(name: str, iteration: Iteration) -> dict[str, Any]:
+    """Return an iteration as a row of metrics.jsonl, for `read_histories`."""
     evaluation = iteration.evaluation
     gradient = jax.tree.map(np.multiply, evaluation.gradient, iteration.weights)
 
@@ -127,27 +126,7 @@ def as_line(name: str, iteration: Iteration) -> str:
     }
     if iteration.weights.others:  # others may be zero and have no logarithm
         row["gradient"] = dict(evaluation.gradient.others)
-    plain = msgspec.to_builtins(row, enc_hook=lambda x: np.asarray(x).tolist())
-    return as_json(plain) + "\n"
-
-
-def write_histories(path: Path, histories: Histories) -> None:
-    """Write metrics.jsonl anew, tuning by tuning; while they run, `add_iteration` appends to it.
-
-    Raises:
-        WriteError: the file cannot be written; the old file stays.
-    """
-    lines = (as_line(name, i) for name, history in histories.items() for i in history)
-    write_file(path, "".join(lines).encode())
-
-
-def add_iteration(path: Path, name: str, iteration: Iteration) -> None:
-    """Append a line to metrics.jsonl.
-
-    Raises:
-        WriteError: the file cannot be written.
-    """
-    append_file(path, as_line(name, iteration).encode())
+    return msgspec.to_builtins(row, enc_hook=lambda x: np.asarray(x).tolist())
 
 
 def read_histories(folder: Path) -> dict[str, list[Iteration]]:
@@ -159,22 +138,14 @@ def read_histories(folder: Path) -> dict[str, list[Iteration]]:
         InputError: one line naming the file and the line that is not an iteration.
     """
     path, histories = folder / METRICS, {}
-    if not path.exists():
-        return histories
-    text = read_text(path, "the iterations of a run of `hector tune`", _MAX_BYTES)
-    for number, line in enumerate(text.rpartition("\n")[0].splitlines(), 1):
-        try:
-            row = json.loads(line)
-            histories.setdefault(row["set"], []).append(_iteration(row))
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise InputError(
-                f"{path}, line {number}: an iteration of a tuning was expected ({error!r})"
-            ) from None
+    if path.exists():
+        for name, iteration in read_rows(path, "a tuning", _named_iteration):
+            histories.setdefault(name, []).append(iteration)
     return histories
 
 
-def _iteration(row: Mapping[str, Any]) -> Iteration:
-    """Return the iteration of a line of `as_line`; null, written for non-finite values, is NaN."""
+def _named_iteration(row: Mapping[str, Any]) -> tuple[str, Iteration]:
+    """Return set and iteration of a row of `as_row`; null, for a non-finite number, is NaN."""
     number = partial(np.array, dtype=float)  # NaN of None
 
     like = named_like(row["weights"])
@@ -190,7 +161,7 @@ def _iteration(row: Mapping[str, Any]) -> Iteration:
         return jax.tree.map(np.asarray, weights._replace(others=others))
 
     weights = vector(row["weights"])
-    return Iteration(
+    return row["set"], Iteration(
         iteration=np.array(row["iteration"]),
         weights=tree(weights, row["weights"]),
         evaluation=Evaluation(

@@ -14,12 +14,12 @@ from hector_jax.control.trajectories import command_of
 from hector_jax.control.weights import nominal
 from hector_jax.core.console import bar, say, say_if_slow
 from hector_jax.core.environment import code_hash
-from hector_jax.core.files import locked
+from hector_jax.core.files import locked, make_folder
 from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError, plural, short_repr
+from hector_jax.core.journal import check_settings
 from hector_jax.core.settings import POSITIVE, SEED, Range, check
-from hector_jax.core.tree_file import check_settings
-from hector_jax.grfm import collection, dataset, network, training
+from hector_jax.grfm import dataset, network, training
 from hector_jax.grfm.effect import HISTORY, last_command
 from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.grfm.nets import History
@@ -28,13 +28,14 @@ from hector_jax.grfm.paper import LinearMap, fit_linear
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import Robot
 from hector_jax.sim.engine import ENGINES, choose_engine
+from hector_jax.store import collection
 from hector_jax.store.cache import content_key, robot_hash
 from hector_jax.store.setup import Setup
 from hector_jax.store.tunings import TUNING_CODE, compile_programs, tune_config, tuning_paths
 
 # modules that determine the numbers, for `code_hash`
 TRAINING_CODE = ("store.nets", "grfm.training")
-COLLECTION_CODE = (*TUNING_CODE, "grfm.collection", "grfm.jobs", "sim.walk", "sim.parallel")
+COLLECTION_CODE = (*TUNING_CODE, "store.collection", "grfm.jobs", "sim.walk", "sim.parallel")
 
 
 @dataclass(frozen=True)
@@ -97,15 +98,14 @@ def collect_walks(pool: Executor, config: CollectConfig, robot: Robot, folder: P
         compile_programs(setup, nominal(robot), command_of("straight"))
         paths = tuning_paths(pool, robot, folder / "paths")
         jobs = draw_jobs(config.seed, config.walks, paths, seconds=config.seconds, robot=robot)
-        with bar(f"collecting {what}") as report_progress:
-            collection.collect(
-                folder,
-                jobs,
-                lambda missing: engine.walk(pool, walk_config(robot), robot, missing, exact=False),
-                robot=robot,
-                settings=collection_settings(config, robot),
-                progress=lambda done, n: report_progress(done, n, "" if done else "compiling"),
-            )
+        collection.collect(
+            folder,
+            jobs,
+            lambda missing: engine.walk(pool, walk_config(robot), robot, missing, exact=False),
+            robot=robot,
+            settings=collection_settings(config, robot),
+            title=f"collecting {what}",
+        )
 
 
 class SampleSets(NamedTuple):
@@ -140,11 +140,7 @@ def train_net(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Tr
     Raises:
         InputError: the folder cannot be written; there are no walks, or damaged ones.
     """
-    with locked(path.parent):
-        return _train(config, robot, folder, path)
-
-
-def _train(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> TrainedNet:
+    make_folder(path.parent)
     with say_if_slow(f"reading the walks in {folder}"):
         parts = samples(robot, folder)
     count = plural(len(parts.training.walk), "sample")
@@ -234,13 +230,13 @@ def load_or_train(
     config = TrainConfig(variant=variant)
     walks, path = data / "walks", net_path(data, config.variant)
     settings = collection_settings(CollectConfig(), robot)
-    if not (walks / "card.json").exists():
+    if not collection.is_finished(walks):
         collect_walks(pool, CollectConfig(), robot, walks)
     made_of = collection.fingerprint(walks)
     check_settings(walks, {name: made_of.get(name) for name in settings}, settings)
     with locked(data):  # a second process waits here, and then loads the net
         if not path.exists():
-            return _train(config, robot, walks, path)
+            return train_net(config, robot, walks, path)
     net, inputs = load_trained(path, robot, config.variant)
     check_settings(path, inputs["settings"], training_settings(config, robot))
     check_settings(path, inputs["made_of"], made_of)

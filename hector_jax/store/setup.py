@@ -13,4 +13,3 @@ class Setup(NamedTuple):
     pool: Executor  # worker processes
     config: TuneConfig  # controller, rollouts and loss
     robot: Robot  # nominal body
-    commit: str = ""  # of the code, recorded with new artefacts; empty if unknown

@@ -23,6 +23,7 @@ from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.console import bar, say
 from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import plural
+from hector_jax.core.journal import add_row, write_rows
 from hector_jax.core.tree import stack
 from hector_jax.grfm import network
 from hector_jax.robot.model import Robot
@@ -31,13 +32,21 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
 from hector_jax.store.cache import content_key, load_or_make
-from hector_jax.store.folder import add_iteration, write_histories
+from hector_jax.store.folder import as_row
 from hector_jax.store.setup import Setup
-from hector_jax.tuning import batch, difftune, evaluate
+from hector_jax.tuning import batch, difftune
+from hector_jax.tuning.curvature import gauss_newton_jit
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning, step_status
-from hector_jax.tuning.evaluate import Objective, mean_objective
+from hector_jax.tuning.evaluate import (
+    Evaluation,
+    Objective,
+    Walk,
+    evaluate_jit,
+    gradient_norms,
+    mean_objective,
+)
 from hector_jax.tuning.loss import loss_of_robot
-from hector_jax.tuning.rollout import Scenario, rollout_config
+from hector_jax.tuning.rollout import Scenario, rollout, rollout_config
 from hector_jax.tuning.status import StepStatus
 from hector_jax.tuning.variation import drawn_variation
 
@@ -53,22 +62,15 @@ class Problem(NamedTuple):
     draws: int = 0  # drawn variations of the model for each command; 0: the model as it is
 
 
-class Tuned(NamedTuple):
-    """A tuning with its history."""
-
-    tuning: Tuning
-    commit: str  # of the code that made it; empty if unknown
-
-
 def artefact(setup: Setup, start: Weights) -> dict[str, Any]:
     """Return the options of `load_or_make` for tunings."""
     config, empty = setup.config, np.zeros(0)
     weights = difftune.init(config, start).start  # with the other numbers that are tuned
     rows = jax.tree.map(lambda w: np.zeros((0, *w.shape)), weights)
     terms = {term.name: empty for term in config.loss}
-    evaluation = evaluate.Evaluation(empty, terms, rows, empty, empty)
+    evaluation = Evaluation(empty, terms, rows, empty, empty)
     history = Iteration(empty, rows, evaluation, empty, empty)
-    like = Tuned(Tuning(weights, np.zeros(()), np.zeros((0, 0)), np.zeros(()), history), "")
+    like = Tuning(weights, np.zeros(()), np.zeros((0, 0)), np.zeros(()), history)
     return {"like": lambda _: like, "kind": "tuning", "robot": setup.robot}
 
 
@@ -92,23 +94,26 @@ def rollouts_of(config: TuneConfig, robot: Robot, problem: Problem) -> list[Scen
     return scenarios
 
 
-def _evaluation_job(
-    config: TuneConfig, scenario: Scenario, weights: Weights
-) -> evaluate.Evaluation:
-    return jax.device_get(difftune.tune_step(config, scenario, weights))
+def evaluation_job(
+    config: TuneConfig, scenario: Any, weights: Weights, walk: Walk = rollout
+) -> Evaluation:
+    """Evaluate weights, see `evaluate`; a job of a worker process."""
+    return jax.device_get(evaluate_jit(config.rollout, scenario, weights, config.loss, walk=walk))
 
 
-def _matrix_job(
-    config: TuneConfig, scenario: Scenario, weights: Weights
+def matrix_job(
+    config: TuneConfig, scenario: Any, weights: Weights, walk: Walk = rollout
 ) -> Float[np.ndarray, "n n"]:
-    return np.asarray(difftune.model_objective(config, scenario).matrix(weights))
+    """Compute the matrix of weights, see `gauss_newton`; a job of a worker process."""
+    inputs = {"walk": walk, "others": config.others}
+    return np.asarray(gauss_newton_jit(config.rollout, scenario, weights, config.loss, **inputs))
 
 
 def _usable(
     config: TuneConfig,
     problem: Problem,
     scenarios: list[Scenario],
-    found: Sequence[evaluate.Evaluation],
+    found: Sequence[Evaluation],
 ) -> tuple[list[Scenario], Float[np.ndarray, " n"]]:
     """Return the rollouts of a problem that count, and their losses at the start.
 
@@ -134,20 +139,20 @@ def _objective(setup: Setup, start: Weights, problem: Problem) -> Objective:
 
     All rollouts of an evaluation, or their matrices, are computed at the same time.
     """
-    pool, config, robot, _ = setup
+    pool, config, robot = setup
 
     def of_all(
         job: Callable[..., Any], scenarios: Sequence[Scenario], weights: Weights
     ) -> list[Any]:
         host = jax.tree.map(np.asarray, weights)
-        return [f.result() for f in [pool.submit(job, config, s, host) for s in scenarios]]
+        return list(pool.map(job, repeat(config), scenarios, repeat(host)))
 
     scenarios, losses = rollouts_of(config, robot, problem), np.ones(1)
     if len(scenarios) > 1:
-        found = of_all(_evaluation_job, scenarios, start)
+        found = of_all(evaluation_job, scenarios, start)
         scenarios, losses = _usable(config, problem, scenarios, found)
-    evaluations = partial(of_all, _evaluation_job, scenarios)
-    return mean_objective(evaluations, partial(of_all, _matrix_job, scenarios), losses)
+    evaluations = partial(of_all, evaluation_job, scenarios)
+    return mean_objective(evaluations, partial(of_all, matrix_job, scenarios), losses)
 
 
 def _tune_on_cpu(
@@ -160,11 +165,11 @@ def _tune_on_cpu(
 
 def _tune_on_gpu(setup: Setup, start: Weights, problem: Problem) -> Tuning:
     """Run one tuning on the accelerator, as a batch of one."""
-    _, config, robot, _ = setup
+    _, config, robot = setup
     models, losses = rollouts_of(config, robot, problem), np.ones(1)
     if len(models) > 1:
         at = difftune.init(config, start).start
-        found = [_evaluation_job(config, model, at) for model in models]
+        found = [evaluation_job(config, model, at) for model in models]
         models, losses = _usable(config, problem, models, found)
     effects = [model.effect for model in (models if problem.draws else models[:1])]
     scenarios = [
@@ -189,7 +194,7 @@ def _tunings(
     problems: Mapping[str, Problem],
     title: str,
     on_iteration: Callable[[str, Iteration], None],
-) -> Iterator[tuple[str, Tuned]]:
+) -> Iterator[tuple[str, Tuning]]:
     """Tune several problems in parallel and yield each tuning with its name when it ends.
 
     Where there is a GPU they are tuned there, in turn; else threads of this process step the
@@ -202,7 +207,7 @@ def _tunings(
                 tuning = _tune_on_gpu(setup, start, problem)
                 for iteration in tuning.iterations:
                     on_iteration(name, iteration)
-                yield name, Tuned(tuning, setup.commit)
+                yield name, tuning
         return
     done, total = 0, setup.config.iterations * len(problems)
     messages: SimpleQueue[tuple[str, Iteration]] = SimpleQueue()
@@ -223,7 +228,7 @@ def _tunings(
                 report_progress(done, total, remark)
                 on_iteration(name, iteration)
             for future in ended:
-                yield running.pop(future), Tuned(future.result(), setup.commit)
+                yield running.pop(future), future.result()
 
 
 def tune_all(
@@ -234,8 +239,8 @@ def tune_all(
     title: str,
     start: Weights | None = None,
     metrics: Path | None = None,
-    before: Mapping[str, Tuned] | None = None,
-) -> dict[str, Tuned]:
+    before: Mapping[str, Tuning] | None = None,
+) -> dict[str, Tuning]:
     """Tune several problems in parallel; finished tunings are saved in `folder`.
 
     For a problem with several commands the mean of the losses is minimised, each divided by its
@@ -247,7 +252,7 @@ def tune_all(
         folder: folder of the tunings, a file for each; tunings in it are not repeated.
         start: weights at the start; the nominal weights by default.
         title: title of the progress bar.
-        metrics: file of the iterations, see `folder.as_line`.
+        metrics: file of the iterations, see `folder.as_row`.
         before: earlier tunings whose iterations are in that file too.
 
     Raises:
@@ -262,16 +267,16 @@ def tune_all(
         phi = "" if net is None else function_id(network.variant_of(net).apply)
         paths[name] = folder / f"tuning-{name}-{key(*problem, phi)}.npz"
 
-    def write(tuned: Mapping[str, Tuned]) -> None:
+    def write(tuned: Mapping[str, Tuning]) -> None:
         if metrics is not None:
             histories = {**(before or {}), **tuned}.items()
-            write_histories(metrics, {name: t.tuning.iterations for name, t in histories})
+            write_rows(metrics, (as_row(name, i) for name, t in histories for i in t.iterations))
 
     def on_iteration(name: str, iteration: Iteration) -> None:
         if metrics is not None:
-            add_iteration(metrics, name, iteration)
+            add_row(metrics, as_row(name, iteration))
 
-    def make(missing: list[str], stored: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuned]]:
+    def make(missing: list[str], stored: Mapping[str, Tuning]) -> Iterator[tuple[str, Tuning]]:
         write(stored)
         remaining = {name: problems[name] for name in missing}
         return _tunings(setup, start, remaining, title, on_iteration)
@@ -283,7 +288,7 @@ def tune_all(
 
 def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:
     results = [
-        evaluate.gradient_norms(config.rollout, scenario, nominal(robot), config.loss)
+        gradient_norms(config.rollout, scenario, nominal(robot), config.loss)
         for scenario in rollouts_of(config, robot, problem)
     ]
     return jax.tree.map(lambda *x: float(np.mean(x)), *results)
@@ -292,7 +297,7 @@ def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, 
 def mean_norms(setup: Setup, problems: Mapping[str, Problem]) -> dict[str, dict[str, float]]:
     """Return norms of the gradients of the loss terms at nominal weights, means over commands."""
     with bar("norms of the gradients") as report_progress:
-        pool, config, robot, _ = setup
+        pool, config, robot = setup
         running = {n: pool.submit(_norms_job, config, robot, p) for n, p in problems.items()}
         report_progress(0, len(problems), "compiling")
         return {name: future.result() for name, future in running.items()}
@@ -322,7 +327,7 @@ def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
     problems = {name: Problem((named_command(name),), None) for name in COMMANDS}
     title = "tuning paths on the rigid body, for the data"
     tuned = tune_all(Setup(pool, tune_config(robot), robot), problems, folder, title=title)
-    histories = [tuned[name].tuning.iterations for name in COMMANDS]
+    histories = [tuned[name].iterations for name in COMMANDS]
     return [stack([i.weights for i in history if i.accepted]) for history in histories]
 
 
@@ -330,10 +335,11 @@ def _prepare_tuning(config: TuneConfig, robot: Robot, start: Weights, problem: P
     """Compile the programs of a tuning, so that its first call need not."""
     scenario, *_ = rollouts_of(config, robot, problem)
     weights = difftune.init(config, start).start
-    evaluation = jax.device_get(difftune.tune_step(config, scenario, weights))
+    found = evaluate_jit(config.rollout, scenario, weights, config.loss, walk=rollout)
+    evaluation = jax.device_get(found)
     if not problem.draws:
         difftune.check_start(StepStatus(int(step_status(config, evaluation))), evaluation)
-    _matrix_job(config, scenario, weights)
+    matrix_job(config, scenario, weights)
 
 
 def compile_programs(
@@ -357,18 +363,19 @@ def compile_programs(
     Raises:
         InputError: with the weights at the start the model falls or a QP is not solved.
     """
-    pool, config, robot, _ = setup
+    pool, config, robot = setup
     job = Job(start, trajectory.command, hfs(robot.description))
     job = on_host(job._replace(seconds=trajectory.seconds or job.seconds))
     walking = pool.submit(
         not_the_weights, config.rollout.walk, jax.tree.map(np.asarray, robot), job
     )
-    plain = config, start, Problem((trajectory.command,), None)
-    configs, starts, problems = zip(plain, *others, strict=True)
-    preparing = pool.map(_prepare_tuning, configs, repeat(robot), starts, problems)
+    preparing, plain = [], (config, start, Problem((trajectory.command,), None))
+    for settings, weights, problem in (plain, *others):
+        preparing.append(pool.submit(_prepare_tuning, settings, robot, weights, problem))
     meanwhile()
     with bar("compiling, once on a machine") as report_progress:
-        report_progress(0, len(configs), "")
-        for done, _ in enumerate(preparing, 1):
-            report_progress(done, len(configs), "")
+        report_progress(0, len(preparing), "")
+        for done, job in enumerate(preparing, 1):
+            job.result()
+            report_progress(done, len(preparing), "")
     return walking.result()

@@ -151,8 +151,9 @@ def _evaluate(
     stacked = over_scenarios(value)
     weighted_sum = partial(jnp.tensordot, tail_weights(stacked.loss, problem.tail), axes=1)
     loss, terms, gradient = jax.tree.map(weighted_sum, stacked[:3])
-    checks = jnp.max(stacked.fallen), jnp.max(stacked.residual)
-    evaluation, none = Evaluation(loss, terms, gradient, *checks), jnp.zeros_like(state.rule.matrix)
+    fallen, residual = jnp.max(stacked.fallen), jnp.max(stacked.residual)
+    evaluation = Evaluation(loss, terms, gradient, fallen, residual)
+    none = jnp.zeros_like(state.rule.matrix)
     return evaluation, jax.lax.cond(
         difftune.needs_matrix(config, state, evaluation),
         lambda: weighted_sum(over_scenarios(curvature)),

@@ -252,8 +252,8 @@ def update(
     updates, after = rule.update(gradient, state.rule, state.steps, **given)
     after = cast(StepState, after)
     steps = optax.apply_updates(state.steps, updates)
-    box = parameters.step_bounds(state.start, config.others)
-    steps = optax.projections.projection_box(steps, *box)
+    lower, upper = parameters.step_bounds(state.start, config.others)
+    steps = optax.projections.projection_box(steps, lower, upper)
 
     stop = jnp.where(iteration >= config.iterations, Stop.LIMIT, Stop.GOING)
     if config.rule == "gauss_newton":
@@ -265,9 +265,8 @@ def update(
         stop = jnp.where(after.size < SMALLEST_STEP, Stop.SMALL_STEP, stop)
     stop = jnp.where(~begun & (status != StepStatus.ACCEPTED), Stop.BAD_START, stop)
     step_size = jnp.where(begun, state.rule.size, 0.0)
-    row = iteration, trial, evaluation, status, step_size
     after = TuneState(state.start, steps, after, iteration + 1, stop.astype(jnp.int32))
-    return after, Iteration(*row)
+    return after, Iteration(iteration, trial, evaluation, status, step_size)
 
 
 _update = jax.jit(update, static_argnums=0)

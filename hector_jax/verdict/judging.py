@@ -40,7 +40,6 @@ class ScoredWalk(NamedTuple):
     score: metrics.Score
     upright: Float[np.ndarray, ""]  # [s] until a fall or the end; below zero in the start-up
     last: State  # last upright state
-    commit: str  # of the code that walked; empty if unknown
     startup: str  # description of a fall in the start-up; empty if there is none
 
 
@@ -60,7 +59,7 @@ def walk_jobs(
     setup: Setup, jobs: Sequence[Job], title: str, engine: Engine = MUJOCO_C
 ) -> Iterator[Trajectory]:
     """Yield the walks of jobs in order, each when it is available."""
-    pool, config, robot, _ = setup
+    pool, config, robot = setup
     with bar(title) as report_progress:
         report_progress(0, len(jobs), "compiling")
         for done, walk in enumerate(engine.walk(pool, config.rollout.walk, robot, jobs), 1):
@@ -78,7 +77,7 @@ def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: f
 
 def _score_walk(setup: Setup, job: Job, walk: Trajectory, engine: Engine) -> ScoredWalk:
     """Score a walk; simulate it again in MuJoCo C if it fell in the start-up."""
-    pool, config, robot, commit = setup
+    pool, config, robot = setup
     samples, text = int(np.sum(~np.asarray(walk.fallen))), ""  # upright samples
     upright = samples * float(walk.period)
     if not samples and not engine.differs:
@@ -87,18 +86,18 @@ def _score_walk(setup: Setup, job: Job, walk: Trajectory, engine: Engine) -> Sco
             upright, text = fall.time, str(fall)
     last = jax.tree.map(lambda x: np.asarray(x)[max(samples - 1, 0)], walk.state)
     score = metrics.score(config.loss, walk)
-    return ScoredWalk(score, np.asarray(upright), last, commit, text)
+    return ScoredWalk(score, np.asarray(upright), last, text)
 
 
 def _like(setup: Setup, with_walk: bool) -> Any:
     """Return the structure of the artefact of one walk, with or without its trajectory."""
     walk = no_samples(len(setup.robot.joint_lower), len(setup.robot.foot_point))
     score = metrics.score_like(loss=setup.config.loss)
-    return ScoredWalk(score, np.zeros(()), walk.initial, "", ""), walk if with_walk else None
+    return ScoredWalk(score, np.zeros(()), walk.initial, ""), walk if with_walk else None
 
 
 def _file_name(setup: Setup, case: Case, job: Job, with_walk: bool, engine: Engine) -> str:
-    _, config, robot, _ = setup
+    _, config, robot = setup
     parts = [engine.key, config.rollout.walk, repr(config.loss), robot, job]
     key = content_key(*parts, *([job.plant] if job.plant else []), code=(*engine.modules, *_CODE))
     return "-".join(["walk" if with_walk else "score", *map(str, case), f"{key}.npz"])

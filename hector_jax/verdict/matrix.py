@@ -125,8 +125,8 @@ def falls(cells: Cells, name: str) -> Falls:
     """Count the falls of a set in some cells, and the plants on which it falls."""
     seeds = np.concatenate([np.repeat(v.seeds, len(v.scenes)) for v in cells.values()])
     fallen = np.concatenate([v.scores[name].fallen.ravel() for v in cells.values()])
-    plants = len(set(seeds[fallen])), len(set(seeds))
-    return Falls(int(fallen.sum()), len(seeds), *plants, fall_share(*plants))
+    fell, plants = len(set(seeds[fallen])), len(set(seeds))
+    return Falls(int(fallen.sum()), len(seeds), fell, plants, fall_share(fell, plants))
 
 
 def fall_share(fallen: int, plants: int) -> Interval:
@@ -176,11 +176,12 @@ def agreements(cells: Cells) -> list[Agreement]:
 
     result = []
     for trajectory in trajectories_of(cells):
-        for pair in combinations([c for c, t in cells if t == trajectory], 2):
-            losses = _losses_on_shared_seeds([cells[column, trajectory] for column in pair])
-            medians = [[float(np.median(L)) for L in by_set.values()] for by_set in losses]
-            tau = float(stats.kendalltau(*medians).statistic)
-            result.append(Agreement(trajectory, *pair, tau))
+        for first, second in combinations([c for c, t in cells if t == trajectory], 2):
+            verdicts = [cells[first, trajectory], cells[second, trajectory]]
+            losses = _losses_on_shared_seeds(verdicts)
+            one, other = ([float(np.median(L)) for L in by_set.values()] for by_set in losses)
+            tau = float(stats.kendalltau(one, other).statistic)
+            result.append(Agreement(trajectory, first, second, tau))
     return result
 
 

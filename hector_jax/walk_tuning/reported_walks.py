@@ -23,9 +23,9 @@ def read_reports(pool: Executor, campaign: Campaign) -> list[walks.Row]:
     """Return the walks so far, scored by the present code; begin the record if it is new.
 
     Raises:
-        InputError: see `walks.read_history`; or the weights or a log of a walk are damaged.
+        InputError: see `walks.read_record`; or the weights or a log of a walk are damaged.
     """
-    rows, space = walks.read_history(campaign), walks.campaign_space(pool, campaign)
+    (rows, _), space = walks.read_record(campaign), walks.campaign_space(pool, campaign)
     for number, old in enumerate(rows):
         weights = load_weights(walks.weights_path(campaign.folder, number), campaign.robot)
         point = point_of(campaign, space, weights)
@@ -41,11 +41,10 @@ def read_reports(pool: Executor, campaign: Campaign) -> list[walks.Row]:
 def add_report(
     pool: Executor, campaign: Campaign, proposal: Proposal, files: Sequence[Path]
 ) -> list[walks.Row]:
-    """Save a walk in the folder, first copies of its logs, then its row; return all rows."""
-    rows = walks.read_history(campaign)
+    """Save a walk in the folder, first copies of its logs, then its line; return all rows."""
+    rows, _ = walks.read_record(campaign)
     number, logs = len(rows), [file.read_bytes() for file in files]
     _set_aside(campaign, number)  # logs of a report that was undone or interrupted
-    walks.proposal_path(campaign, number + 1).unlink(missing_ok=True)  # it followed that report
     for path, log in zip(walks.log_paths(campaign, number), logs, strict=True):
         write_file(path, log)
     walks.add_walk(campaign, rows, proposal, walks.evaluate_logs(pool, campaign, number))
@@ -59,13 +58,15 @@ def undo_report(campaign: Campaign) -> tuple[int, list[Path]]:
         Number of the walk, and its logs under the names that they have from now on.
 
     Raises:
-        InputError: there is none, or see `walks.read_history`.
+        InputError: there is none, or see `walks.read_record`.
     """
-    number, path = len(walks.read_history(campaign)) - 1, campaign.folder / walks.RECORD
-    if number < 0:
+    (rows, _), path = walks.read_record(campaign), campaign.folder / walks.RECORD
+    if not rows:
         raise InputError(f"{campaign.folder}: no report to undo")
-    # the one step that counts: what waits for its walk follows from the number of rows
-    write_file(path, b"".join(path.read_bytes().splitlines(keepends=True)[:-1]))
+    # The one step that counts. Settings, proposals and walks stay up to the last proposal walked.
+    lines = path.read_bytes().splitlines(keepends=True)
+    write_file(path, b"".join(lines[: 2 * len(rows)]))
+    number = len(rows) - 1
     return number, _set_aside(campaign, number)
 
 

@@ -42,11 +42,10 @@ def losses_on_hfs(
         engine: engine of the walks.
         at_once: number of walks for which a program is compiled; fewer walks are padded to it.
     """
-    pool, config, robot, _ = setup
+    pool, config, robot = setup
     walk, plant = config.rollout.walk, hfs(robot.description)
     seconds = config.rollout.ticks * walk.gait.tick
-    cases = [(weights, commands[name]) for name, group in sets.items() for weights in group]
-    jobs = [Job(*case, plant, seconds) for case in cases]
+    jobs = [Job(w, commands[name], plant, seconds) for name, group in sets.items() for w in group]
     walks = engine.walk(pool, walk, robot, jobs, batch=at_once)
     rows = [(float(loss_of(config.loss, w)), np.max(w.residual) <= SOLVED) for w in walks]
     ends = np.cumsum([len(group) for group in sets.values()])

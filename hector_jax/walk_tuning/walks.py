@@ -4,9 +4,9 @@ Whether a simulator (`tune_on_walks`) or a real robot (`hector propose`, `hector
 same functions read the logs and make the proposals (search/few_walks.py), and all that they use is
 in the folder:
 
-- `walks.jsonl`: settings, then a line for each proposal that was walked.
+- `walks.jsonl`: settings, then a line for each proposal and, once it was walked, one for its walk.
 - `logs/3-0.npz`: the log of walk 3 in case 0, at the plan interval, or the file that was reported.
-- `weights/3.json`, `proposals/3.json`: the weights of walk 3, and how they were proposed.
+- `weights/3.json`: the weights of walk 3.
 - `metric.npz`: the Gauss-Newton matrix at the start, which defines the coordinates of all points.
 
 A weight set is walked in each case: all commands, on each plant. Its loss is the mean over the
@@ -30,22 +30,18 @@ from hector_jax.control.weights import Weights, direction_names
 from hector_jax.control.weights_file import save_weights, weights_tree
 from hector_jax.core.console import bar, say
 from hector_jax.core.environment import code_hash
-from hector_jax.core.files import write_json
-from hector_jax.core.inputs import InputError, one_line, plural
-from hector_jax.core.settings import read_json
+from hector_jax.core.inputs import InputError, plural
+from hector_jax.core.journal import add_row, continue_journal
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
 from hector_jax.grfm import network
 from hector_jax.search import few_walks
-from hector_jax.search.cmaes import add_row, read_journal
 from hector_jax.search.few_walks import Model, Proposal, Space, WalkResult
 from hector_jax.sim.loop import Job
 from hector_jax.store import tunings
 from hector_jax.store.cache import content_key, robot_hash
 from hector_jax.store.setup import Setup
-from hector_jax.tuning.curvature import gauss_newton_jit
-from hector_jax.tuning.difftune import TuneConfig, step_status
-from hector_jax.tuning.evaluate import Evaluation, evaluate_jit
+from hector_jax.tuning.difftune import step_status
 from hector_jax.tuning.grounded import Grounding, fit_grounding, grounded_rollout
 from hector_jax.tuning.rollout import Scenario
 from hector_jax.tuning.status import StepStatus
@@ -105,20 +101,11 @@ def _ground_job(campaign: Campaign, weights: Weights, command: Command, log: Log
     return jax.device_get(grounding)
 
 
-def _evaluate_job(config: TuneConfig, grounding: Grounding, weights: Weights) -> Evaluation:
-    inputs = config.rollout, grounding, weights, config.loss
-    return jax.device_get(evaluate_jit(*inputs, walk=grounded_rollout))
-
-
-def _matrix_job(config: TuneConfig, grounding: Grounding, weights: Weights) -> Any:
-    inputs = config.rollout, grounding, weights, config.loss
-    return np.asarray(gauss_newton_jit(*inputs, walk=grounded_rollout, others=config.others))
-
-
 def row_of(proposal: Proposal, cases: Sequence[ScoredLog]) -> Row:
     """Return the row of a proposal and the scores of its walks."""
-    losses = np.array([score.loss for score, _ in cases])
-    return Row(*proposal, losses, max(score.margin for score, _ in cases))
+    losses, margin = zip(*((score.loss, score.margin) for score, _ in cases), strict=True)
+    point, method, predicted = proposal
+    return Row(point, method, predicted, np.array(losses), max(margin))
 
 
 # The folder
@@ -141,17 +128,17 @@ def campaign_space(pool: Executor, campaign: Campaign) -> Space:
     return few_walks.space_of(tree["matrix"], box_of(campaign))
 
 
-def read_history(campaign: Campaign) -> list[Row]:
-    """Return the walks so far; begin the record if the campaign is new.
+def read_record(campaign: Campaign) -> tuple[list[Row], Proposal | None]:
+    """Return the walks so far and the proposal that waits for its walk; begin a new record.
 
     Those that were reported are scored as they were then: see `reported_walks.read_reports`.
 
     Raises:
         InputError: the folder holds the record of another campaign, or a damaged one.
     """
-    size, engine, hint = len(box_of(campaign)), campaign.engine, ""
+    size, engine, remedy = len(box_of(campaign)), campaign.engine, "choose another folder"
     head: dict[str, Any] = {
-        "format": 2,
+        "format": 3,
         "robot": robot_hash(campaign.robot),
         "start": weights_tree(campaign.start),
         "settings": content_key(campaign.config, campaign.start, code=()),
@@ -163,7 +150,7 @@ def read_history(campaign: Campaign) -> list[Row]:
     if campaign.reported:  # data: neither code nor loss can make them those of another campaign
         settings = {"seconds": campaign.seconds, "numbers": list(campaign.numbers)}
         head |= {"robot": walker_hash(campaign.robot), "settings": settings}
-        hint = f" and begin anew with hector propose --start {campaign.folder}/weights/N.json"
+        remedy += f" and begin anew with hector propose --start {campaign.folder}/weights/N.json"
     else:
         head |= {
             "model": campaign.model,
@@ -171,15 +158,21 @@ def read_history(campaign: Campaign) -> list[Row]:
             "code": code_hash("walk_tuning.walks", *engine.modules),
         }
 
-    def parse(row: Mapping[str, Any]) -> Row:
-        point, losses = np.array(row["point"], float), np.array(row["losses"], float)
-        if (got := (point.shape, losses.shape)) != ((size,), (len(campaign.cases),)):
-            raise ValueError(f"point and losses of shapes {got}")
-        losses = np.where(np.isfinite(losses), losses, np.inf)
-        return Row(point, row["method"], row["predicted"], losses, float(row["margin"]))
+    def parse(row: Mapping[str, Any]) -> Any:  # a `Proposal`, or losses and margin of its walk
+        name, length = ("losses", len(campaign.cases)) if "losses" in row else ("point", size)
+        if (values := np.array(row[name], float)).shape != (length,):
+            raise ValueError(f"{name} of shape {values.shape}")
+        if name == "point":
+            return Proposal(values, row["method"], row["predicted"])
+        return np.where(np.isfinite(values), values, np.inf), float(row["margin"])
 
-    path, what = campaign.folder / RECORD, "tuning on walks"
-    return read_journal(path, head, what=what, parse=parse, hint=hint)
+    path = campaign.folder / RECORD
+    lines = continue_journal(path, head, "a tuning on walks", parse, remedy)
+    proposals, walked = lines[::2], lines[1::2]
+    if not all(isinstance(line, Proposal) == (i % 2 == 0) for i, line in enumerate(lines)):
+        raise InputError(f"{path}: a walk without a proposal, or a proposal without a walk")
+    rows = [Row(*proposal, *walk) for proposal, walk in zip(proposals, walked, strict=False)]
+    return rows, proposals[-1] if len(proposals) > len(walked) else None
 
 
 def _walked(rows: Sequence[Row]) -> list[WalkResult]:
@@ -199,14 +192,14 @@ def next_proposal(
     """Return the next proposal, saved in the folder; it stays the same until it is walked.
 
     Raises:
-        InputError: the start fell, the file of the proposal is damaged, or packages of the extra
-            `search` are missing.
+        InputError: the start fell, or packages of the extra `search` are missing.
     """
     if rows and not _stood(rows[0]):
         raise InputError(
             f"{campaign.folder}: the start fell, or a QP was not solved; tune from another"
         )
-    if (proposal := pending(campaign, len(rows))) is not None:
+    _, proposal = read_record(campaign)
+    if proposal is not None:
         return proposal, weights_at(campaign, space, proposal.point)
     history = _walked(rows)
     has_model = campaign.model != "none" and few_walks.needs_model(history)
@@ -214,32 +207,13 @@ def next_proposal(
     proposal = few_walks.propose(space, history, model, campaign.seed)
     weights = weights_at(campaign, space, proposal.point)
     save_weights(weights_path(campaign.folder, len(rows)), weights)
-    fields = {**proposal._asdict(), "point": proposal.point.tolist()}
-    write_json(proposal_path(campaign, len(rows)), fields)
+    _add_proposal(campaign, proposal)
     return proposal, weights
 
 
-def pending(campaign: Campaign, number: int) -> Proposal | None:
-    """Return the proposal of the next walk, of this number, if it was made.
-
-    Raises:
-        InputError: its file is damaged.
-    """
-    if not (path := proposal_path(campaign, number)).exists():
-        return None
-    table = read_json(path, "a proposal")
-    try:
-        point = np.array(table["point"], float)
-        if point.shape != (len(box_of(campaign)),):
-            raise ValueError(f"a point of shape {point.shape}")
-        return Proposal(point, table["method"], table["predicted"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: damaged: {one_line(error)}; remove it") from None
-
-
-def proposal_path(campaign: Campaign, number: int) -> Path:
-    """Return the file of the proposal of a walk."""
-    return campaign.folder / "proposals" / f"{number}.json"
+def _add_proposal(campaign: Campaign, proposal: Proposal) -> None:
+    fields = {**proposal._asdict(), "point": proposal.point.tolist()}
+    add_row(campaign.folder / RECORD, fields)
 
 
 def weights_path(folder: Path, number: int) -> Path:
@@ -255,11 +229,11 @@ def log_paths(campaign: Campaign, number: int) -> list[Path]:
 
 def evaluate_logs(pool: Executor, campaign: Campaign, number: int) -> list[ScoredLog]:
     """Evaluate the logs of a walk that was reported; see `evaluate_log`."""
-    paths, commands = log_paths(campaign, number), [command for _, command in campaign.cases]
-    tick = campaign.config.rollout.walk.gait.tick
-    logs = [read_log(path, campaign.robot, campaign.seconds, tick) for path in paths]
-    inputs = repeat(campaign.config), repeat(campaign.robot), commands, logs
-    return list(pool.map(evaluate_log, *inputs))
+    config, robot, running = campaign.config, campaign.robot, []
+    for path, (_, command) in zip(log_paths(campaign, number), campaign.cases, strict=True):
+        log = read_log(path, robot, campaign.seconds, config.rollout.walk.gait.tick)
+        running.append(pool.submit(evaluate_log, config, robot, command, log))
+    return [job.result() for job in running]
 
 
 def _plan_logs(pool: Executor, campaign: Campaign, number: int) -> list[Log]:
@@ -276,27 +250,31 @@ def _model(pool: Executor, campaign: Campaign, space: Space, rows: Sequence[Row]
     best = few_walks.best_walk(_walked(rows))
     weights = weights_at(campaign, space, rows[best].point)
     commands = [command for _, command in campaign.cases]
-    inputs = repeat(campaign), repeat(weights), commands, _plan_logs(pool, campaign, best)
-    groundings = list(pool.map(_ground_job, *inputs))
+    logs = _plan_logs(pool, campaign, best)
+    groundings = list(pool.map(_ground_job, repeat(campaign), repeat(weights), commands, logs))
 
     def of_cases(job: Callable[..., Any], weights: Weights) -> list[Any]:
-        return list(pool.map(job, repeat(campaign.config), groundings, repeat(weights)))
+        running = [
+            pool.submit(job, campaign.config, grounding, weights, grounded_rollout)
+            for grounding in groundings
+        ]
+        return [job.result() for job in running]
 
-    at_best = of_cases(_evaluate_job, weights)
+    at_best = of_cases(tunings.evaluation_job, weights)
     model_losses = np.array([case.loss for case in at_best])
     scales = rows[best].losses / rows[0].losses / model_losses / len(commands)
 
     def evaluate(point: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
         weights = weights_at(campaign, space, point)
         walked = np.array_equal(point, rows[best].point)
-        cases = at_best if walked else of_cases(_evaluate_job, weights)
+        cases = at_best if walked else of_cases(tunings.evaluation_job, weights)
         if any(step_status(campaign.config, case) != StepStatus.ACCEPTED for case in cases):
             return np.inf, np.zeros_like(point)
         slopes = [slope_of(campaign, space, weights, case.gradient) for case in cases]
         return float(scales @ [float(case.loss) for case in cases]), scales @ np.array(slopes)
 
     def matrix(point: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
-        matrices = of_cases(_matrix_job, weights_at(campaign, space, point))
+        matrices = of_cases(tunings.matrix_job, weights_at(campaign, space, point))
         return matrix_of(campaign, space, np.tensordot(scales, matrices, axes=1))
 
     return Model(evaluate, matrix)
@@ -305,16 +283,17 @@ def _model(pool: Executor, campaign: Campaign, space: Space, rows: Sequence[Row]
 def add_walk(
     campaign: Campaign, rows: Sequence[Row], proposal: Proposal, cases: Sequence[ScoredLog]
 ) -> list[Row]:
-    """Append a walk to the history and save it in the folder: first its logs, then its row.
+    """Append a walk to the history and save it in the folder: first its logs, then its line.
 
-    The logs of a walk that was reported are there already.
+    The logs of a walk that was reported are there already, and mostly its proposal.
     """
+    if read_record(campaign)[1] is None:
+        _add_proposal(campaign, proposal)
     if not campaign.reported:
         for path, (_, log) in zip(log_paths(campaign, len(rows)), cases, strict=True):
             save_tree(path, log, kind="log", robot=campaign.robot)
     row = row_of(proposal, cases)
-    arrays = {"point": row.point.tolist(), "losses": row.losses.tolist()}
-    add_row(campaign.folder / RECORD, row._asdict() | arrays)
+    add_row(campaign.folder / RECORD, {"losses": row.losses.tolist(), "margin": row.margin})
     return [*rows, row]
 
 
@@ -343,19 +322,16 @@ def tune_on_walks(pool: Executor, campaign: Campaign, walks: int) -> list[Row]:
             nothing is tuned.
 
     Raises:
-        InputError: see `next_proposal` and `read_history`.
+        InputError: see `next_proposal` and `read_record`.
     """
-    rows, space, cases = (
-        read_history(campaign),
-        campaign_space(pool, campaign),
-        len(campaign.cases),
-    )
+    space, cases = campaign_space(pool, campaign), len(campaign.cases)
+    rows, _ = read_record(campaign)
     with bar(f"tuning with {plural(walks, 'walk')}") as report_progress:
         while not rows or (_stood(rows[0]) and (len(rows) + 1) * cases <= walks):
             report_progress(len(rows) * cases, walks, _progress(campaign, space, rows))
             proposal, weights = next_proposal(pool, campaign, space, rows)
-            inputs = repeat(campaign), repeat(weights), range(cases)
-            rows = add_walk(campaign, rows, proposal, list(pool.map(walk_case, *inputs)))
+            walked = list(pool.map(walk_case, repeat(campaign), repeat(weights), range(cases)))
+            rows = add_walk(campaign, rows, proposal, walked)
         report_progress(len(rows) * cases, walks, _progress(campaign, space, rows))
     if campaign.leg_numbers and all(row.method in ("start", "model") for row in rows):
         say(f"{', '.join(campaign.leg_numbers)} were not moved: walks beyond the model are needed")
