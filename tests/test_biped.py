@@ -14,7 +14,7 @@ from hector_jax.control.controller import WalkConfig, walk_config
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.inputs import InputError
-from hector_jax.export.export import find_weights
+from hector_jax.export.export import controller_of_run, find_weights
 from hector_jax.robot.description import Description
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.loop import Job
@@ -95,7 +95,8 @@ def test_strider_is_tuned_by_the_same_command_and_a_run_knows_its_robot(
     with pytest.raises(ValueError, match="made for robot"):
         load_walks(tmp_path / "data" / "strider" / "walks", load_robot())
     (run,) = (tmp_path / "runs" / "strider" / "straight").iterdir()
-    assert find_weights(run, "with") == (run / "weights" / "with.json", walk_config(strider))
+    assert find_weights(run, "with") == run / "weights" / "with.json"
+    assert controller_of_run(run) == walk_config(strider)
     assert runs.read_request(run).robot == STRIDER
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     for name in ("without", "with"):

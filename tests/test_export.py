@@ -39,6 +39,7 @@ from hector_jax.export.export import (
     SCHEMA,
     TOLERANCE,
     controller,
+    controller_of_run,
     export_controller,
     find_weights,
     load_controller,
@@ -350,9 +351,10 @@ def test_a_run_is_exported_with_its_own_controller(run):
     kept = to_table(own)
     del kept["mpc"]["effort_reference"]  # of a run from before there was such a setting
     (run / "config.json").write_text(json.dumps({"tune": {"rollout": {"walk": kept}}}))
-    assert find_weights(run, "best") == (run / "weights" / "best.json", own)
+    assert find_weights(run, "best") == run / "weights" / "best.json"
+    assert controller_of_run(run) == own
     path = run / "weights" / "best.json"
-    assert find_weights(path, "best") == (path, None)
+    assert find_weights(path, "best") == path
 
 
 def test_a_set_that_is_not_there_is_one_line_and_writes_nothing(monkeypatch, capsys, run):

@@ -18,6 +18,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
 from hector_jax.core.settings import as_toml, to_table
 from hector_jax.export import export
+from hector_jax.export.template import fill_template
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.importing.propose import RobotProposal, propose_robot, standard_form
 from hector_jax.importing.remarks import differences, remarks
@@ -213,17 +214,25 @@ def _write_robot(out: Path, proposal: RobotProposal, comments: Sequence[str], fi
 
 @run.register
 def run_export(args: flags.Export) -> None:
-    """Export the controller of a run, checked against the live one."""
+    """Export the controller of a run, checked against the live one; or fill a template."""
     is_run = args.run.is_dir()
+    path = export.find_weights(args.run, args.set)
+    folder = args.out or (args.run if is_run else args.run.parent) / "export"
+    if args.template:
+        out = folder / args.template.name.removesuffix(".j2")
+        if out.resolve() == args.template.resolve():
+            raise InputError(f"--template {out} would be overwritten; name it {out.name}.j2")
+        write_file(out, fill_template(args.template, path).encode())
+        say(f"{out} has the weights {path}")
+        return
     if is_run and args.robot:
         raise InputError(f"--robot is for weights files; the run {args.run} names its own robot")
     request = read_request(args.run) if is_run else None
-    path, config = export.find_weights(args.run, args.set)
+    config = export.controller_of_run(args.run) if is_run else None
     robot = arguments.robot_of_run(args.run, request) if request else load_robot(args.robot)
     text = args.traj or (request.trajectory if request else "straight")
     trajectory = arguments.load_trajectory(text, robot)
     name = f"{args.run.resolve().name}/{path.stem}" if is_run else path.stem
-    folder = args.out or (args.run if is_run else args.run.parent) / "export"
     weights = load_weights(path, robot)
     say("exporting the controller and comparing it with the live one on a walk")
     with locked(folder):

@@ -57,24 +57,30 @@ _STATES = ("roll, pitch, yaw", "x, y, z", "their rates: wx, wy, wz", "vx, vy, vz
 _INPUTS = ("force, foot 0 (left)", "force, foot 1 (right)", "moment, foot 0", "moment, foot 1")
 
 
-def find_weights(run: Path, name: str) -> tuple[Path, WalkConfig | None]:
-    """Find the file of a weight set and the controller that it was tuned for.
+def find_weights(run: Path, name: str) -> Path:
+    """Find the file of a weight set.
 
     Args:
         run: folder of a run, or a weights file.
         name: name of the set in the folder.
 
-    Returns:
-        The file, and the controller; None for a weights file, which does not name its controller.
-
     Raises:
-        InputError: one line with what is missing or wrong, and the available sets.
+        InputError: one line with what is missing, and the available sets.
     """
     if not run.is_dir():
-        return run, None
+        return run
     sets = sorted(path.stem for path in (run / "weights").glob("*.json"))
     if name not in sets:
         raise InputError(f"{run}: {unknown('weight set', name, sets)}")
+    return run / "weights" / f"{name}.json"
+
+
+def controller_of_run(run: Path) -> WalkConfig:
+    """Return the controller that a run has tuned.
+
+    Raises:
+        InputError: its settings are damaged or of another version.
+    """
     path = run / CONFIG
     config = read_json(path, "the settings of a run")
     try:
@@ -82,8 +88,7 @@ def find_weights(run: Path, name: str) -> tuple[Path, WalkConfig | None]:
     except (KeyError, TypeError) as error:
         raise InputError(f"{path}: not the settings of a walking controller: {error!r}") from error
     # a setting that this version does not know is refused: the file goes to a robot
-    walk_config = from_table(f"{path}: tune.rollout.walk", WalkConfig, table)
-    return run / "weights" / f"{name}.json", walk_config
+    return from_table(f"{path}: tune.rollout.walk", WalkConfig, table)
 
 
 def _constants(config: WalkConfig, robot: Robot, lead: int) -> dict[str, Any]:
