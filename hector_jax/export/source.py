@@ -152,7 +152,7 @@ def _sizes(config: WalkConfig, sides: int) -> dict[str, Any]:
     """Return the sizes of the QP, what it costs and the memory that it takes."""
     feet, steps, model = len(config.gait.offsets), config.mpc.horizon, config.mpc.contact
     contacts, usual = steps * feet, steps * config.gait.most_contacts * model.inputs
-    variables, limit = contacts * model.inputs, 60 + 4 * usual
+    variables, limit = contacts * model.inputs, 100 + 6 * usual
 
     def work(n: int, active: int, changes: int) -> float:
         """Return multiplications: three factorisations' worth, and the changes of active rows."""
