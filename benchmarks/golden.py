@@ -33,7 +33,6 @@ from hector_jax.core.console import say
 from hector_jax.core.runtime import setup_jax
 from hector_jax.core.trajectory import State, Trajectory
 from hector_jax.core.tree import stack
-from hector_jax.export.export import controller, export_controller, load_controller
 from hector_jax.grfm import dataset, training
 from hector_jax.grfm.collection import Walks
 from hector_jax.grfm.effect import last_command
@@ -237,15 +236,6 @@ def walks() -> Arrays:
     return found
 
 
-def exported() -> Arrays:
-    """One call of the exported controller, in a tick that plans."""
-    robot = load_robot()
-    call = load_controller(export_controller(WalkConfig(), robot, expert()))
-    _, example = controller(WalkConfig(), robot, expert())
-    _, out = call(*example)
-    return {"call": _flat([out["force"], out["moment"], out["torque"]])}
-
-
 SECTIONS: dict[str, Section] = {
     "qp": (qp, 1e-12),
     "tick": (tick, 1e-12),
@@ -254,7 +244,6 @@ SECTIONS: dict[str, Section] = {
     "tunings": (tunings, 1e-9),
     "seconds": (seconds, 1e-9),
     "walks": (walks, 1e-6),
-    "exported": (exported, 1e-12),
 }
 
 

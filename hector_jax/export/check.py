@@ -24,6 +24,7 @@ from hector_jax.control.reference import Anchor, Command, anchor_at, standing_an
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.console import Broken
+from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Wrench
 from hector_jax.export.source import PIECES
@@ -123,17 +124,20 @@ def compiler() -> str | None:
     return shutil.which("cc")
 
 
-def compile_controller(folder: Path, *flags: str) -> Path:
-    """Compile `controller.c` of a folder there, with warnings as errors. Returns the library.
+def compile_controller(source: dict[str, str], folder: Path, *flags: str) -> Path:
+    """Write the files of `controller_source` into a folder and compile them, warnings as errors.
+
+    Returns:
+        The shared library, beside them.
 
     Raises:
-        Broken: the compiler refuses it.
+        Broken: the compiler refuses them.
     """
-    library = folder / "controller.so"
+    for file, text in source.items():
+        write_file(folder / file, text.encode())
     words = [compiler() or "cc", *FLAGS, *flags, "-fPIC", "-shared", "controller.c", "-lm"]
-    done = subprocess.run(
-        [*words, "-o", library.name], cwd=folder, capture_output=True, text=True, check=False
-    )
+    library = folder / "controller.so"
+    done = subprocess.run([*words, "-o", library.name], cwd=folder, capture_output=True, text=True)
     if done.returncode:
         raise Broken(f"the compiler refuses controller.c: {done.stderr.strip().splitlines()[0]}")
     return library

@@ -106,9 +106,8 @@ def _checked(
         say("there is no C compiler (cc): the check of controller.c did not run")
         return None
     with tempfile.TemporaryDirectory() as folder:
-        for file, text in source.items():
-            write_file(Path(folder) / file, text.encode())
-        result = compare_with_live(config, robot, compile_controller(Path(folder)), recorded)
+        library = compile_controller(source, Path(folder))
+        result = compare_with_live(config, robot, library, recorded)
     _require_same(result)
     return {"milliseconds": len(recorded.torque), **result._asdict()}
 

@@ -46,7 +46,13 @@ _TEMPLATES = Environment(
 
 
 def controller_source(
-    config: WalkConfig, robot: Robot, weights: Weights, *, name: str, content: bytes, pieces: int = 0
+    config: WalkConfig,
+    robot: Robot,
+    weights: Weights,
+    *,
+    name: str,
+    content: bytes,
+    pieces: int = 0,
 ) -> dict[str, str]:
     """Return `controller.c` and `controller.h` by their names.
 
