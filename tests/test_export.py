@@ -52,6 +52,8 @@ from hector_jax.export.export import SCHEMA, find_weights, weights_cpp
 from hector_jax.export.source import controller_source
 from hector_jax.qp import QP, Status, solve_qp
 from hector_jax.robot.model import load_robot
+from hector_jax.sim.loop import Job
+from hector_jax.sim.world import ideal
 from hector_jax.store.cache import robot_hash
 
 pytestmark = pytest.mark.usefixtures("on_cpu")
@@ -252,9 +254,13 @@ def answers(library, inputs, before=lambda i, compiled: None):
     return out
 
 
+def walk_of(command, seconds, weights=TUNED):
+    return record(CONFIG, ROBOT, Job(weights, command, ideal(), seconds))
+
+
 @pytest.fixture(scope="module")
 def walked():
-    return record(CONFIG, ROBOT, TUNED, command=named_command("s"), seconds=0.4)
+    return walk_of(named_command("s"), 0.4)
 
 
 def assert_same(found):
@@ -272,7 +278,7 @@ def test_the_compiled_controller_answers_as_the_live_one_did(library, walked):
 @needs_cc
 def test_measured_yaw_and_anchor_may_be_of_any_turn(library):
     command = Command(np.full(2, 4.0), np.array([[0.2, 0.0]] * 2), np.full(2, 0.5 * np.pi))
-    walked = record(CONFIG, ROBOT, TUNED, command=command, seconds=2.4)
+    walked = walk_of(command, 2.4)
     state = walked.measurement.state
     yaw = state.euler[:, 2]
     assert abs(yaw[-1]) > 3.3
@@ -516,7 +522,7 @@ def test_address_and_undefined_behaviour_are_clean_along_the_walk(walked, tmp_pa
 def test_weights_that_fall_and_constraints_of_ones_own_are_refused():
     limp = TUNED._replace(Q=jax.tree.map(lambda w: 1e-6 * w, nominal().Q))
     with pytest.raises(ValueError, match="fall"):
-        record(CONFIG, ROBOT, limp, command=named_command("straight"), seconds=0.2)
+        walk_of(named_command("straight"), 0.2, limp)
     own = replace(CONFIG, mpc=MpcConfig(costs=(StateCost("low", of=None),)))
     with pytest.raises(ValueError, match="no costs beside Q and R, got low"):
         source_of(TUNED, own)

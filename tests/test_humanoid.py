@@ -25,7 +25,7 @@ from hector_jax.robot.model import load_robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import walk
-from hector_jax.sim.world import hfs
+from hector_jax.sim.world import hfs, ideal
 from hector_jax.tuning.rollout import RolloutConfig, Scenario
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -169,7 +169,7 @@ def test_both_engines_walk_alike(robot):
 def test_the_controller_in_c_answers_as_the_live_one(robot, tmp_path):
     config, weights = walk_config(robot), nominal(robot)
     source = controller_source(config, robot, weights, name="nominal", content=b"")
-    walked = record(config, robot, weights, command=named_command("s"), seconds=0.4)
+    walked = record(config, robot, Job(weights, named_command("s"), ideal(robot.description), 0.4))
     found = compare_with_live(config, robot, compile_controller(source, tmp_path), walked)
     assert max(found.force, found.moment, found.torque) <= 1e-8
     assert found.unsolved == 0

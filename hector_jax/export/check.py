@@ -21,7 +21,6 @@ from jaxtyping import Float
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.legs import Measurement
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
-from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.console import Broken
 from hector_jax.core.files import write_file
@@ -34,7 +33,7 @@ from hector_jax.sim import sensing
 from hector_jax.sim.loop import Job, first_tick, substeps
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
-from hector_jax.sim.world import build_world, ideal, standing_qpos
+from hector_jax.sim.world import build_world, standing_qpos
 
 FLAGS = "-std=c99 -Wall -Wextra -Wconversion -Werror -O2".split()
 
@@ -55,15 +54,13 @@ class WalkRecord(NamedTuple):
     torque: Float[np.ndarray, "T joints"]  # [N m]
 
 
-def record(
-    config: WalkConfig, robot: Robot, weights: Weights, *, command: Command, seconds: float
-) -> WalkRecord:
+def record(config: WalkConfig, robot: Robot, job: Job) -> WalkRecord:
     """Walk in the ideal world and record the inputs and outputs of the controller.
 
     Raises:
         InputError: the robot falls.
     """
-    plant = ideal(robot.description)
+    plant = job.imperfections
     world = build_world(plant, robot.description)
     standing = standing_qpos(world, robot.standing_joints, float(robot.trunk_height))
     rows = [np.concatenate([standing, np.zeros(world.model.nv + 1)])[sensing.coordinates(world)]]
@@ -74,16 +71,11 @@ def record(
         entries = np.concatenate([data.qpos, data.qvel, np.zeros(1)])
         rows.append(entries[sensing.coordinates(world)])
 
-    trajectory = walk(
-        config,
-        robot,
-        Job(weights, command, plant, seconds),
-        build=partial(MujocoPlant, on_step=append),
-    )
+    trajectory = walk(config, robot, job, build=partial(MujocoPlant, on_step=append))
     if np.asarray(trajectory.fallen).any():
         raise InputError(
-            f"with these weights the robot falls within {seconds:g} s in the ideal world: there is "
-            "no walk to check the export on"
+            f"with these weights the robot falls within {job.seconds:g} s in the ideal world: "
+            "there is no walk to check the export on"
         )
 
     @jax.jit
@@ -97,7 +89,7 @@ def record(
     host = partial(jax.tree.map, np.asarray)
     return WalkRecord(
         measurement=host(measurements(np.stack(rows[:-1]))),
-        command=host(command),
+        command=host(job.command),
         standing=host(standing_anchor(robot)),
         anchor=host(anchor_at(robot, jax.tree.map(jnp.asarray, trajectory.initial), 0)),
         lead=-first_tick(config) * substeps(config),

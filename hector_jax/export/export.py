@@ -36,6 +36,8 @@ from hector_jax.export.check import (
 )
 from hector_jax.export.source import controller_source
 from hector_jax.robot.model import Robot
+from hector_jax.sim.loop import Job
+from hector_jax.sim.world import ideal
 from hector_jax.store.folder import CONFIG
 
 SCHEMA = "weights.schema.json"
@@ -144,7 +146,8 @@ def export(
     source = controller_source(
         config, robot, weights, name=name, content=weights_json, pieces=len(command.duration)
     )
-    recorded = record(config, robot, weights, command=command, seconds=seconds)
+    job = Job(weights, command, ideal(robot.description), seconds)
+    recorded = record(config, robot, job)
     check = _checked(config, robot, source, recorded)
     # the card has the hashes of the other files: it is removed first and written last
     (folder / "controller.json").unlink(missing_ok=True)
