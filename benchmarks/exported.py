@@ -47,8 +47,8 @@ void last_qp(int *sizes, double *P, double *q, double *A, double *bound) {
     FOR(i, n) FOR(j, n) P[i * n + j] = before.P[i][j];
     FOR(i, n) q[i] = before.q[i];
     FOR(i, m) FOR(j, n) A[i * n + j] = 0.0;
-    FOR(i, m) FOR(j, INPUTS) A[i * n + i / SIDES * INPUTS + j] = before.A[i / SIDES][i % SIDES][j];
-    FOR(i, m) bound[i] = before.bound[i / SIDES][i % SIDES];
+    FOR(i, m) FOR(j, INPUTS) A[i * n + i / SIDES * INPUTS + j] = before.A[i][j];
+    FOR(i, m) bound[i] = before.bound[i];
 }
 """
 

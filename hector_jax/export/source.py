@@ -4,7 +4,9 @@ The templates are the C program; what is filled in are sizes, tables and the con
 """
 
 import hashlib
+import json
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -71,18 +73,27 @@ def controller_source(
     if own:
         text = f"the C controller has the constraints {', '.join(_SIDES)} and no costs beside Q and"
         raise InputError(f"{text} R, got {', '.join(own)}")
+    sides = sum(_SIDES[part] for part in constraints)
     values = {
-        "robot": robot.description.name,
-        "name": name,
+        "title": f"{robot.description.name} with the weights {name}".replace("*/", "* /"),
         "sha256": hashlib.sha256(content).hexdigest(),
+        "feet": FEET[len(robot.foot_point)],
+        "joints": robot.description.joints,
+        "com": robot.com_offset,
+        "height": float(robot.standing_height),
         "pieces": max(pieces, PIECES),
-        "tolerance": mpc.qp.tolerances(jnp.dtype(float)).residual,
+        "period": substeps(config),
+        "lead": -first_tick(config) * substeps(config),
         "constraints": constraints,
-        **_of_robot(config, robot),
-        **_of_times(config),
-        **_sizes(config, sum(_SIDES[part] for part in constraints)),
+        "signs": list(product((1.0, -1.0), repeat=3)),
+        "moments": max(mpc.contact.components) > 2,
+        "footholds": config.footstep.rule,
+        "closed_form": robot.structure.closed_form,
+        "sizes": _sizes(config, sides),
+        "numbers": _numbers(config, robot),
+        "tables": _tables(config, robot),
+        "tunables": dict(_tunables(config, robot, weights)),
     }
-    values["tunables"] = dict(_tunables(config, robot, weights))
     return {f: _TEMPLATES.get_template(f"{f}.j2").render(c=_c, **values) for f in FILES}
 
 
@@ -90,93 +101,90 @@ FILES = ("controller.h", "controller.c")
 
 
 def _c(value: Any) -> str:
-    """Return an array as a C initialiser, to the last bit."""
+    """Return a value as C writes it, numbers to the last bit and arrays as an initialiser."""
+    if isinstance(value, str):
+        return json.dumps(value)
     if np.ndim(value):
         return "{ " + ", ".join(map(_c, value)) + " }"
     return "INFINITY" if value == np.inf else repr(np.asarray(value).item())
 
 
-def _of_times(config: WalkConfig) -> dict[str, Any]:
-    """Return the times of gait and plan."""
-    gait = config.gait
+def _numbers(config: WalkConfig, robot: Robot) -> dict[str, Any]:
+    """Return the numbers of controller and robot, in SI units and in ticks."""
+    gait, mpc, slip = config.gait, config.mpc, config.slip
     return {
-        "horizon": config.mpc.horizon,
-        "tick": gait.tick,
-        "dt": config.mpc_step,
-        "step_ticks": config.mpc.step_ticks,
-        "stance": gait.stance,
-        "swing": gait.swing,
-        "first_tick": gait.first_tick,
-        "lead_ticks": np.rint(gait.cycle * np.array(gait.offsets)).astype(int),
-        "begin": first_tick(config),
-        "period": substeps(config),
-        "lead": -first_tick(config) * substeps(config),
+        "TICK": gait.tick,
+        "STANCE": gait.stance,
+        "SWING": gait.swing,
+        "CYCLE": gait.cycle,
+        "BEGIN": first_tick(config),
+        "FIRST_TICK": gait.first_tick,
+        "STEPS": mpc.horizon,
+        "STEP_TICKS": mpc.step_ticks,
+        "DT": config.mpc_step,
+        "MASS": robot.mass,
+        "MAX_FORCE": mpc.max_force,
+        "TOE": robot.toe,
+        "HEEL": robot.heel,
+        "HALF_WIDTH": mpc.sole_width * robot.half_width,
+        "SLIP_DISTANCE": slip.distance * robot.standing_height,
+        "SLIP_LOSS": 1.0 - slip.share,
+        "RECOVERY": slip.recovery,
+        "PLACED": len(robot.structure.placed),
+        "NEWTON_STEPS": NEWTON_STEPS,
+        "TOLERANCE": mpc.qp.tolerances(jnp.dtype(float)).residual,
     }
 
 
-def _of_robot(config: WalkConfig, robot: Robot) -> dict[str, Any]:
-    """Return the tables of the robot, joints leg by leg."""
-    structure, count = robot.structure, len(robot.foot_point)
-    by_leg = {
-        part: np.asarray(getattr(robot, part)).reshape(count, -1)
-        for part in ("joint_lower", "joint_upper", "standing_joints", "link_mass")
-    }
-    inertia = jnp.asarray(config.mpc.planned_inertia(robot.inertia))
-    axes = robot.joint_axis
-    return {
-        "feet": FEET[count],
-        "joints": np.reshape(robot.description.joints, (count, -1)).tolist(),
-        "mass": float(robot.mass),
-        "gravity": robot.gravity,
-        "max_force": config.mpc.max_force,
-        "inverse_inertia": np.asarray(inverse(inertia)),
-        "com_offset": robot.com_offset,
-        "height": float(robot.standing_height),
-        "toe": float(robot.toe),
-        "heel": float(robot.heel),
-        "half_width": float(config.mpc.sole_width * robot.half_width),
-        "foot_ahead": robot.foot_ahead,
-        "footholds": config.footstep.rule,
-        "slip_distance": float(config.slip.distance * robot.standing_height),
-        "slip_share": config.slip.share,
-        "recovery": config.slip.recovery,
-        "joint_origin": robot.joint_origin,
+def _tables(config: WalkConfig, robot: Robot) -> dict[str, Any]:
+    """Return the arrays of controller and robot, joints leg by leg."""
+    structure, gait, count = robot.structure, config.gait, len(robot.foot_point)
+    axes, inertia = robot.joint_axis, config.mpc.planned_inertia(robot.inertia)
+    tables = {
+        "LEAD": np.rint(gait.cycle * np.array(gait.offsets)).astype(int),
+        "COMPONENT": np.array(config.mpc.contact.components),
+        "GRAVITY": robot.gravity,
+        "INVERSE_INERTIA": np.asarray(inverse(jnp.asarray(inertia))),
+        "COM": robot.com_offset,
+        "FOOT_AHEAD": robot.foot_ahead,
+        "ORIGIN": robot.joint_origin,
         # the closed form takes its axes as exact
-        "joint_axis": np.round(axes) if structure.closed_form else axes,
-        "foot_point": robot.foot_point,
-        "soles": robot.sole,
-        "link_com": robot.link_com,
-        "torque_limit": robot.torque_limit,
-        "closed_form": structure.closed_form,
-        "placed": structure.placed,
-        "newton_steps": NEWTON_STEPS,
-        **by_leg,
+        "AXIS": np.round(axes) if structure.closed_form else axes,
+        "FOOT_POINT": robot.foot_point,
+        "SOLE": robot.sole,
+        "LINK_MASS": robot.link_mass,
+        "LINK_COM": robot.link_com,
+        "LOWER": robot.joint_lower.reshape(count, -1),
+        "UPPER": robot.joint_upper.reshape(count, -1),
+        "TORQUE_LIMIT": robot.torque_limit,
+        "STANDING": robot.standing_joints.reshape(count, -1),
+        "PLACED_ROW": np.array(structure.placed),
     }
+    unused = ("STANDING", "PLACED_ROW") if structure.closed_form else ()
+    unused += ("FOOT_AHEAD",) if config.footstep.rule == "paper" else ()
+    return {name: table for name, table in tables.items() if name not in unused}
 
 
 def _sizes(config: WalkConfig, sides: int) -> dict[str, Any]:
-    """Return the sizes of the QP, what it costs and the memory that it takes."""
+    """Return the sizes of the QP, and what it costs."""
     feet, steps, model = len(config.gait.offsets), config.mpc.horizon, config.mpc.contact
     contacts, usual = steps * feet, steps * config.gait.most_contacts * model.inputs
     variables, limit = contacts * model.inputs, 100 + 6 * usual
 
-    def work(n: int, active: int, changes: int) -> float:
-        """Return multiplications: three factorisations' worth, and the changes of active rows."""
+    def millions(n: int, active: int, changes: int) -> float:
+        """Return multiplications: factorisations, and the changes of the active set."""
         change = 6 * n * n + 9 * n * active + 6 * active**2 + 2 * contacts * sides * model.inputs
-        return n**3 / 2 + changes * change
+        return 1e-6 * (2 * n**3 + changes * change)
 
     return {
         "contacts": contacts,
         "inputs": model.inputs,
-        "component": model.components,
-        "components": [_COMPONENTS[i] for i in model.components],
-        "moments": max(model.components) > 2,
+        "components": ", ".join(_COMPONENTS[i] for i in model.components),
         "sides": sides,
         "variables": variables,
         "limit": limit,
-        "usual": work(usual, usual // 5, usual // 5),
-        "most": work(variables, variables, limit),
-        "bytes": 8 * (4 * variables**2 + contacts * sides * (model.inputs + 1) + 12 * variables),
+        "usual": round(millions(usual, usual // 5, usual // 5), 1),
+        "most": round(millions(variables, variables, limit)),
     }
 
 
