@@ -92,7 +92,7 @@ def daqp_times(source: dict[str, str], folder: Path, robot: Robot, walked: WalkR
 def measure(seconds: float, robot: Robot) -> tuple[list[str], list[Check]]:
     """Row and checks of a robot over the three trajectories."""
     config, weights = walk_config(robot), nominal(robot)
-    push = Push(np.array([[0.0, 3.0 * robot.mass, 0.0]]), np.array([1.0]), np.array([0.1]))
+    push = Push(np.array([[0.0, 1.0 * robot.mass, 0.0]]), np.array([1.0]), np.array([0.1]))
     source = controller_source(config, robot, weights, name="nominal", content=b"")
     found, daqp = [], []
     with tempfile.TemporaryDirectory() as folder:
