@@ -38,16 +38,7 @@ from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.settings import to_table
 from hector_jax.core.trajectory import State, pack_wrench
 from hector_jax.export import check, export
-from hector_jax.export.check import (
-    Check,
-    Library,
-    compare_with_live,
-    compile_controller,
-    compiler,
-    inputs_of,
-    layout_of,
-    record,
-)
+from hector_jax.export.check import Library, compare_with_live, compile_controller, inputs_of
 from hector_jax.export.export import SCHEMA, find_weights, weights_cpp
 from hector_jax.export.source import controller_source
 from hector_jax.qp import QP, Status, solve_qp
@@ -237,7 +228,7 @@ def exported(tmp_path_factory):
 
 
 def needs_cc():
-    if compiler() is None:
+    if check.compiler() is None:
         pytest.skip("there is no C compiler")
 
 
@@ -254,7 +245,7 @@ def library(tmp_path_factory):
 
 def answers(library, inputs, before=lambda i, compiled: None):
     """The outputs along the inputs; `before` is called before each."""
-    compiled, out = Library(library), np.zeros(len(inputs.estimate), layout_of(ROBOT).output)
+    compiled, out = Library(library), np.zeros(len(inputs.estimate), check.layout_of(ROBOT).output)
     for i in range(len(out)):
         before(i, compiled)
         compiled.step(inputs, out, i)
@@ -262,7 +253,7 @@ def answers(library, inputs, before=lambda i, compiled: None):
 
 
 def walk_of(command, seconds, weights=TUNED):
-    return record(CONFIG, ROBOT, Job(weights, command, ideal(), seconds))
+    return check.record(CONFIG, ROBOT, Job(weights, command, ideal(), seconds))
 
 
 @pytest.fixture(scope="module")
@@ -454,8 +445,7 @@ def test_address_and_undefined_behaviour_are_clean_along_the_walk(walked, tmp_pa
     words = ["cc", HERE / "exported_walk.c", *flags.split(), "-o", "walk"]
     subprocess.run(words, cwd=tmp_path, check=True)
     run = subprocess.run(["./walk", *inputs._fields], cwd=tmp_path, capture_output=True, text=True)
-    assert (run.returncode, run.stderr) == (0, "")
-    assert np.isfinite(float(run.stdout))
+    assert (run.returncode, run.stderr, np.isfinite(float(run.stdout))) == (0, "", True)
 
 
 def test_weights_that_fall_and_constraints_of_ones_own_are_refused():
@@ -523,7 +513,7 @@ def test_what_differs_from_the_live_controller_is_not_written(monkeypatch, capsy
     for part in ("record", "compile_controller"):
         instead(monkeypatch, export, part, lambda *args, **named: None)
     for difference, fault in (({"force": 2e-6}, "2.0e-06 N"), ({"unsolved": 3}, "3 QPs were not")):
-        found = Check(0.0, 0.0, 0.0, 0, {}, {})._replace(**difference)
+        found = check.Check(0.0, 0.0, 0.0, 0, {}, {})._replace(**difference)
         instead(monkeypatch, export, "compare_with_live", lambda *known, found=found: found)
         assert call(monkeypatch, run) == 1
         assert fault in capsys.readouterr().err
