@@ -26,15 +26,31 @@ from hector_jax.robot.kinematics import NEWTON_STEPS
 from hector_jax.robot.model import Robot
 from hector_jax.sim.loop import first_tick, substeps
 
-# sides of a contact for each of the constraints that the template has
+# Sides of a contact by constraint, as C: coefficients of (F_x, F_y, F_z, M_x, M_y, M_z), each F in
+# the world and M in the foot's frame, of which the sum is at most a seventh number, zero by
+# default. The formulas are those of `control.contact`; cs and sn are of the foot's yaw.
 _SIDES = {
-    "friction": 4,
-    "unilateral_force": 2,
-    "line_pressure": 2,
-    "line_friction": 4,
-    "side_pressure": 2,
-    "torsion": 2,
-    "corner_friction": 12,
+    "friction": ["1, 1, -mu", "-1, -1, -mu", "1, -1, -mu", "-1, 1, -mu"],
+    "unilateral_force": ["0, 0, -1", "0, 0, 1, 0, 0, 0, MAX_FORCE"],
+    "line_pressure": ["0, 0, -TOE, 0, -1", "0, 0, -HEEL, 0, 1"],
+    "line_friction": [
+        "-HEEL * sn, HEEL * cs, -grip * HEEL, 0, grip, 1",
+        "HEEL * sn, -HEEL * cs, -grip * HEEL, 0, grip, -1",
+        "-TOE * sn, TOE * cs, -grip * TOE, 0, -grip, -1",
+        "TOE * sn, -TOE * cs, -grip * TOE, 0, -grip, 1",
+    ],
+    "side_pressure": [f"0, 0, -HALF_WIDTH, {s}" for s in (1, -1)],
+    "torsion": [f"0, 0, -0.5 * grip * DIAGONAL, 0, 0, {s}" for s in (1, -1)],
+    "corner_friction": [
+        *("cs, sn, -inner", "-cs, -sn, -inner", "-sn, cs, -inner", "sn, -cs, -inner"),
+        *(
+            f"{a} * HALF_WIDTH * cs - ({b} * HALF_LENGTH - {s} * MIDDLE) * sn, "
+            f"{a} * HALF_WIDTH * sn + ({b} * HALF_LENGTH - {s} * MIDDLE) * cs, "
+            f"inner * ({s * b} * MIDDLE - HALF_LENGTH - HALF_WIDTH), "
+            f"{s * a} * inner, {s * b} * inner, {s}"
+            for a, b, s in product((1, -1), repeat=3)
+        ),
+    ],
 }
 _COMPONENTS = ("F_x", "F_y", "F_z", "M_x", "M_y", "M_z")
 PIECES = 16  # of a command, at least
@@ -73,7 +89,7 @@ def controller_source(
     if own:
         text = f"the C controller has the constraints {', '.join(_SIDES)} and no costs beside Q and"
         raise InputError(f"{text} R, got {', '.join(own)}")
-    sides = sum(_SIDES[part] for part in constraints)
+    sides = [side for part in constraints for side in _SIDES[part]]
     values = {
         "title": f"{robot.description.name} with the weights {name}".replace("*/", "* /"),
         "sha256": hashlib.sha256(content).hexdigest(),
@@ -84,12 +100,11 @@ def controller_source(
         "pieces": max(pieces, PIECES),
         "period": substeps(config),
         "lead": -first_tick(config) * substeps(config),
-        "constraints": constraints,
-        "signs": list(product((1.0, -1.0), repeat=3)),
+        "sides": sides,
         "moments": max(mpc.contact.components) > 2,
         "footholds": config.footstep.rule,
         "closed_form": robot.structure.closed_form,
-        "sizes": _sizes(config, sides),
+        "sizes": _sizes(config, len(sides)),
         "numbers": _numbers(config, robot),
         "tables": _tables(config, robot),
         "tunables": dict(_tunables(config, robot, weights)),
@@ -126,7 +141,10 @@ def _numbers(config: WalkConfig, robot: Robot) -> dict[str, Any]:
         "MAX_FORCE": mpc.max_force,
         "TOE": robot.toe,
         "HEEL": robot.heel,
-        "HALF_WIDTH": mpc.sole_width * robot.half_width,
+        "MIDDLE": 0.5 * (robot.toe - robot.heel),
+        "HALF_LENGTH": (half := 0.5 * (robot.toe + robot.heel)),
+        "HALF_WIDTH": (width := mpc.sole_width * robot.half_width),
+        "DIAGONAL": np.hypot(half, width),
         "SLIP_DISTANCE": slip.distance * robot.standing_height,
         "SLIP_LOSS": 1.0 - slip.share,
         "RECOVERY": slip.recovery,
