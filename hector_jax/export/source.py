@@ -1,6 +1,7 @@
 """The controller as C: `controller.c` and `controller.h` from a configuration and a robot.
 
-The templates are the C program; what is filled in are sizes, tables and the constraints in use.
+The templates are the C program: vectors, gait, reference, torques and interface in `controller`,
+then `legs`, `qp` and `mpc`. What is filled in are sizes, tables and the constraints in use.
 """
 
 import hashlib
@@ -55,7 +56,7 @@ _SIDES = {
 _COMPONENTS = ("F_x", "F_y", "F_z", "M_x", "M_y", "M_z")
 PIECES = 16  # of a command, at least
 _TEMPLATES = Environment(
-    loader=FileSystemLoader(Path(__file__).parent),
+    loader=FileSystemLoader(Path(__file__).parent / "templates"),
     undefined=StrictUndefined,
     trim_blocks=True,
     lstrip_blocks=True,
