@@ -51,6 +51,7 @@ pytestmark = pytest.mark.usefixtures("on_cpu")
 ROBOT, CONFIG = load_robot(), WalkConfig()
 HERE = Path(__file__).parent
 EXAMPLES = HERE.parent / "examples" / "exported"
+WARNINGS = "-Wall -Wextra -Wconversion -Werror -Wframe-larger-than=16000".split()
 BAD_INPUT, OUT_OF_BOUNDS = 6, 7  # of enum controller_status
 
 
@@ -240,7 +241,7 @@ def source_of(weights, config=CONFIG, robot=ROBOT):
 def library(tmp_path_factory):
     """The compiled controller of the tuned weights."""
     needs_cc()
-    return compile_controller(source_of(TUNED), tmp_path_factory.mktemp("c"))
+    return compile_controller(source_of(TUNED), tmp_path_factory.mktemp("c"), *WARNINGS)
 
 
 def answers(library, inputs, before=lambda i, compiled: None):
@@ -268,8 +269,7 @@ def assert_same(found):
 
 def test_the_compiled_controller_answers_as_the_live_one_did(library, walked):
     assert_same(compare_with_live(CONFIG, ROBOT, library, walked))
-    assert np.abs(walked.wrench.force).max() > 100.0
-    assert walked.measurement.state.velocity[-1, 0] > 0.1
+    assert np.abs(walked.wrench.force).max() > 100.0 * walked.measurement.state.velocity[-1, 0] > 10
 
 
 def test_measured_yaw_and_anchor_may_be_of_any_turn(library):
