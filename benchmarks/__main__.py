@@ -20,11 +20,12 @@ from pathlib import Path
 from benchmarks.measuring import Check, Report, child, compare, last_run
 from hector_jax.core.console import say
 
-SECTIONS = ("qp_layer", "closed_loop", "realtime", "collection", "batch", "throughput")
+SECTIONS = ("qp_layer", "closed_loop", "realtime", "exported", "collection", "batch", "throughput")
 QUICK = {
     "qp_layer": ["--problems=20", "--timed=10", "--slow=2", "--rounds=2"],
     "closed_loop": ["--lengths", "40", "200", "--batches", "2", "4"],
     "realtime": ["0.5"],
+    "exported": ["0.5"],
     "collection": ["--batches", "2", "--seconds", "0.05"],
     "batch": ["--singles=2", "--many=4", "--ticks=40"],
     "throughput": ["--batches", "16", "64", "--rollouts=4", "--rounds=2"],

@@ -22,10 +22,17 @@ import numpy as np
 
 from benchmarks import problems
 from experiments import sensitivity
-from hector_jax.control.controller import WalkConfig, walk_config
+from hector_jax.control.controller import (
+    WalkConfig,
+    actuate,
+    contacts_needed,
+    init_memory,
+    step_plan,
+    walk_config,
+)
 from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.gait import GaitConfig
-from hector_jax.control.legs import LegConfig
+from hector_jax.control.legs import LegConfig, Measurement
 from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
 from hector_jax.control.weights import expert, nominal, weights_to_vector
@@ -33,7 +40,6 @@ from hector_jax.core.console import say
 from hector_jax.core.runtime import setup_jax
 from hector_jax.core.trajectory import State, Trajectory
 from hector_jax.core.tree import stack
-from hector_jax.export.export import controller, export_controller, load_controller
 from hector_jax.grfm import dataset, training
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.jobs import draw_jobs
@@ -99,18 +105,29 @@ def qp() -> Arrays:
 
 def _tick(config: WalkConfig, robot: Robot) -> Arrays:
     """Wrench, touchdowns and torques of a plan from a state off the reference."""
-    control, example = controller(config, robot, expert(robot))
-    carry, millisecond, measured, command, anchor = example
-    rng = np.random.default_rng(3)
-    measured = {name: x + 0.01 * rng.normal(size=np.shape(x)) for name, x in measured.items()}
-    command = named_command("s")._asdict()
-    run, found = jax.jit(control), {}
-    begin = 10 * (config.gait.stand - config.gait.first_tick)  # milliseconds before t = 0
+    rng, joints = np.random.default_rng(3), robot.standing_joints
+    anchor, parameters = standing_anchor(robot), config.parameters(expert(robot))
+    state = State(np.zeros(3), np.asarray(anchor.position), np.zeros(3), np.zeros(3))
+    measured = Measurement(state, joints, np.zeros_like(joints))
+    measured = jax.tree.map(lambda x: x + 0.01 * rng.normal(size=np.shape(x)), measured)
+    memory, found = init_memory(robot, measured), {}
     for tick in (-config.gait.stand, 3, 17, 24):
-        at = np.int32(begin + 10 * tick)
-        after, out = run(carry, at, measured, command, anchor)
-        _, later = run(after, at + np.int32(4), measured, command, anchor)
-        found[f"tick {tick}"] = _flat([out["force"], out["moment"], out["torque"], later["torque"]])
+        after, planned = step_plan(
+            config,
+            robot,
+            parameters,
+            command=named_command("s"),
+            anchor=anchor,
+            tick=np.int32(tick),
+            memory=memory,
+            measurement=measured,
+            max_contacts=contacts_needed(config, tick),
+        )
+        now = {"plan": planned, "memory": after, "measurement": measured}
+        torques = [
+            actuate(config, robot, parameters.legs, substep=np.int32(ms), **now) for ms in (0, 4)
+        ]
+        found[f"tick {tick}"] = _flat([planned.wrench, planned.touchdown, torques])
     return found
 
 
@@ -237,15 +254,6 @@ def walks() -> Arrays:
     return found
 
 
-def exported() -> Arrays:
-    """One call of the exported controller, in a tick that plans."""
-    robot = load_robot()
-    call = load_controller(export_controller(WalkConfig(), robot, expert()))
-    _, example = controller(WalkConfig(), robot, expert())
-    _, out = call(*example)
-    return {"call": _flat([out["force"], out["moment"], out["torque"]])}
-
-
 SECTIONS: dict[str, Section] = {
     "qp": (qp, 1e-12),
     "tick": (tick, 1e-12),
@@ -254,7 +262,6 @@ SECTIONS: dict[str, Section] = {
     "tunings": (tunings, 1e-9),
     "seconds": (seconds, 1e-9),
     "walks": (walks, 1e-6),
-    "exported": (exported, 1e-12),
 }
 
 

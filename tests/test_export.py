@@ -1,18 +1,21 @@
-"""What goes to the robot: weights, the C++ controller's own QP, the exported controller."""
+"""What goes to the robot: weights, the C++ controller's own QP, the controller in C."""
 
 import contextlib
-import importlib.util
+import ctypes
 import io
 import json
 import re
-import shutil
+import runpy
+import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import jsonschema
+import mujoco
 import numpy as np
 import pytest
 from model import OTHERS
@@ -20,6 +23,7 @@ from oracles import exact_solution
 from pretend import instead
 from scipy.spatial.transform import Rotation
 
+from benchmarks.problems import draw_problems, layer_qp, pick
 from hector_jax.cli.flags import Tune
 from hector_jax.cli.main import main
 from hector_jax.cli.parse import as_table
@@ -27,31 +31,28 @@ from hector_jax.control.contact import LINE_FRICTION, StateCost
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
+from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.reference import Command, named_command
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.settings import to_table
 from hector_jax.core.trajectory import State, pack_wrench
-from hector_jax.export import export
-from hector_jax.export.controller import Check, compare_with_live, record
-from hector_jax.export.export import (
-    PLATFORMS,
-    SCHEMA,
-    TOLERANCE,
-    controller,
-    controller_of_run,
-    export_controller,
-    find_weights,
-    load_controller,
-    weights_cpp,
-)
-from hector_jax.qp import QP, Status
+from hector_jax.export import check, export
+from hector_jax.export.check import Library, compare_with_live, compile_controller, inputs_of
+from hector_jax.export.export import SCHEMA, controller_of_run, find_weights, weights_cpp
+from hector_jax.export.source import controller_source
+from hector_jax.qp import QP, Status, solve_qp
 from hector_jax.robot.model import load_robot
+from hector_jax.sim.loop import Job
+from hector_jax.sim.world import ideal
 from hector_jax.store.cache import robot_hash
 
 pytestmark = pytest.mark.usefixtures("on_cpu")
 ROBOT, CONFIG = load_robot(), WalkConfig()
-EXAMPLE = Path(__file__).parents[1] / "examples" / "run_exported.py"
+HERE = Path(__file__).parent
+EXAMPLES = HERE.parent / "examples" / "exported"
+WARNINGS = "-Wall -Wextra -Wconversion -Werror -Wframe-larger-than=16000".split()
+BAD_INPUT, OUT_OF_BOUNDS = 6, 7  # of enum controller_status
 
 
 def random_weights(seed):
@@ -190,7 +191,7 @@ def test_the_header_has_our_numbers_and_says_what_the_cpp_controller_lacks():
     assert "friction at toe and heel: False" in header(constraints=without)
 
 
-# The exported controller
+# The controller in C
 
 
 # with numbers of the plan and of the legs
@@ -220,31 +221,60 @@ def call(monkeypatch, *arguments):
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
     """What the command printed for such a run, and the folder that it wrote."""
+    needs_cc()
     run, printed = save_run(tmp_path_factory.mktemp("run")), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
         assert call(patch, run, "--seconds", "0.1", "--json") == 0
     return json.loads(printed.getvalue()), run / "export"
 
 
+def needs_cc():
+    if check.compiler() is None:
+        pytest.skip("there is no C compiler")
+
+
+def source_of(weights, config=CONFIG, robot=ROBOT):
+    return controller_source(config, robot, weights, name="test", content=b"")
+
+
 @pytest.fixture(scope="module")
-def loaded(exported):
-    """The exported controller and an example of its arguments."""
-    content = (exported[1] / "controller-cpu.jaxexport").read_bytes()
-    return load_controller(content), controller(CONFIG, ROBOT, TUNED)[1]
+def library(tmp_path_factory):
+    """The compiled controller of the tuned weights."""
+    needs_cc()
+    return compile_controller(source_of(TUNED), tmp_path_factory.mktemp("c"), *WARNINGS)
 
 
-def test_the_loaded_controller_answers_as_the_live_one_did(loaded):
-    walked = record(CONFIG, ROBOT, TUNED, command=named_command("s"), seconds=0.4)
-    found = compare_with_live(CONFIG, *loaded, walked)
-    assert max(found.force, found.moment, found.torque) <= TOLERANCE
+def answers(library, inputs, before=lambda i, compiled: None):
+    """The outputs along the inputs; `before` is called before each."""
+    compiled, out = Library(library), np.zeros(len(inputs.estimate), check.layout_of(ROBOT).output)
+    for i in range(len(out)):
+        before(i, compiled)
+        compiled.step(inputs, out, i)
+    return out
+
+
+def walk_of(command, seconds, weights=TUNED):
+    return check.record(CONFIG, ROBOT, Job(weights, command, ideal(), seconds))
+
+
+@pytest.fixture(scope="module")
+def walked():
+    return walk_of(named_command("s"), 0.4)
+
+
+def assert_same(found):
+    assert max(found.force, found.moment, found.torque) <= 1e-8
     assert found.unsolved == 0
-    assert np.abs(walked.wrench.force).max() > 100.0
-    assert walked.measurement.state.velocity[-1, 0] > 0.1
 
 
-def test_measured_yaw_and_anchor_may_be_of_any_turn(loaded):
+def test_the_compiled_controller_answers_as_the_live_one_did(library, walked):
+    assert_same(compare_with_live(CONFIG, ROBOT, library, walked))
+    assert np.abs(walked.wrench.force).max() > 100.0 * walked.measurement.state.velocity[-1, 0] > 10
+
+
+def test_measured_yaw_and_anchor_may_be_of_any_turn(library):
     command = Command(np.full(2, 4.0), np.array([[0.2, 0.0]] * 2), np.full(2, 0.5 * np.pi))
-    walked = record(CONFIG, ROBOT, TUNED, command=command, seconds=2.4)
+    walked = walk_of(command, 2.4)
     state = walked.measurement.state
     yaw = state.euler[:, 2]
     assert abs(yaw[-1]) > 3.3
@@ -258,47 +288,173 @@ def test_measured_yaw_and_anchor_may_be_of_any_turn(loaded):
             for known, turn in zip((walked.standing, walked.anchor), turns, strict=True)
         )
         again = walked._replace(measurement=measurement, standing=standing, anchor=anchor)
-        found = compare_with_live(CONFIG, *loaded, again)
-        assert max(found.force, found.moment, found.torque) <= TOLERANCE
-        assert found.unsolved == 0
+        assert_same(compare_with_live(CONFIG, ROBOT, library, again))
 
 
-def test_a_yaw_that_is_no_number_is_seen_and_then_forgotten(loaded):
-    control, (carry, _, measured, command, anchor) = loaded
-    lost = measured | {"euler": np.array([0.0, 0.0, np.nan])}
-    torques = []
-    for i, now in enumerate([measured, measured, lost, measured]):
-        carry, out = control(carry, np.int32(i), now, command, anchor)
-        torques.append(np.isfinite(out["torque"]).all())
-    assert torques == [True, True, False, True]
+def test_what_is_no_number_has_a_status_and_the_torques_of_the_call_before(library, walked):
+    """Also in the millisecond of a plan, which is then made in the next."""
+    inputs, lost = inputs_of(walked, ROBOT), [0, 3, 500, 501]
+    inputs.estimate["euler"][[0, 500], 2] = np.nan
+    inputs.estimate["joints"][3, 0], inputs.estimate["position"][501, 1] = np.inf, -np.inf
+    out = answers(library, inputs)
+    assert np.flatnonzero(out["status"] == BAD_INPUT).tolist() == lost
+    assert not out["torque"][0].any()
+    np.testing.assert_array_equal(out["torque"][500:502], out["torque"][[499, 499]])
+    np.testing.assert_array_equal(out["force"][500:502], out["force"][[499, 499]])
+    assert np.abs(out["force"][502] - out["force"][499]).max() > 1e-6  # planned
+    np.testing.assert_allclose(out["torque"][502:], walked.torque[502:], atol=1.0)
 
 
-@pytest.mark.parametrize(("weights", "part", "least"), [(nominal, 0, 1.0), (expert, 2, 0.1)])
-def test_the_check_notices_other_weights(loaded, weights, part, least):
-    """Also those that differ in the numbers of plan and legs alone: the torque tells."""
-    other = CONFIG.with_others(weights(), OTHERS)
-    walked = record(CONFIG, ROBOT, other, command=named_command("s"), seconds=0.1)
-    assert compare_with_live(CONFIG, *loaded, walked)[part] > least
+def test_no_pieces_and_huge_numbers_are_bad_inputs_too(library, walked):
+    inputs = inputs_of(walked, ROBOT)
+    for name, value in (("pieces", 0), ("pieces", 17), ("duration", 0.0), ("yaw_rate", np.nan)):
+        command = inputs.command.copy()
+        command[name] = value
+        assert answers(library, inputs._replace(command=command))["status"][0] == BAD_INPUT
+    inputs.estimate["joint_rates"][5], inputs.estimate["velocity"][10] = 1e308, 1e307
+    out = answers(library, inputs)
+    assert np.isfinite(out["torque"]).all()
+    assert out["status"][10] in (Status.BAD_DATA, Status.INACCURATE, BAD_INPUT)
 
 
-@pytest.mark.parametrize("platform", PLATFORMS)
-def test_only_custom_calls_with_a_guarantee_are_in_it(exported, platform):
-    content = (exported[1] / f"controller-{platform}.jaxexport").read_bytes()
-    found = jax.export.deserialize(bytearray(content))
-    assert found.platforms == (platform,)
-    assert not found.disabled_safety_checks
-    calls = set(re.findall(r"custom_call @(\w+)", found.mlir_module()))
-    assert calls
-    assert all(name.startswith(("lapack_", "cusolver_", "cu_lu_")) for name in calls), calls
+def exported_numbers(functions):
+    """A copy of the struct of tunables: Q, R, scalars, kp and kd."""
+    kind = ctypes.c_double * (24 + len(TUNABLES) - 2 + 10)
+    return kind(*kind.in_dll(functions, "controller_exported"))
 
 
-def test_weights_that_fall_and_another_device_are_refused(monkeypatch):
+def test_other_weights_count_from_the_next_plan_on(library, walked, tmp_path):
+    second = compile_controller(source_of(CONFIG.with_others(nominal(), OTHERS)), tmp_path)
+    numbers = exported_numbers(ctypes.CDLL(str(second)))
+
+    def change(i, compiled):
+        if i == 503:
+            assert compiled.functions.controller_set_tunables(compiled.memory, numbers) == 0
+
+    inputs = inputs_of(walked, ROBOT)
+    changed, before = answers(library, inputs, change), answers(library, inputs)
+    after = answers(second, inputs)  # whose memory is the same: both have no integral action
+    np.testing.assert_array_equal(changed[:510], before[:510])
+    for name in ("torque", "force", "moment"):
+        np.testing.assert_allclose(changed[name][510:], after[name][510:], atol=1e-6)
+        assert np.abs(changed[name][510:] - before[name][510:]).max() > 1e-2
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, 1e13, np.nan, np.inf])
+def test_weights_out_of_bounds_are_refused_and_change_nothing(library, walked, value):
+    def change(i, compiled):
+        if i == 3:
+            numbers = exported_numbers(compiled.functions)
+            numbers[4] = value
+            found = compiled.functions.controller_set_tunables(compiled.memory, numbers)
+            assert found == OUT_OF_BOUNDS
+
+    inputs = inputs_of(walked, ROBOT)
+    inputs = inputs._replace(estimate=inputs.estimate[:30], anchor=inputs.anchor[:30])
+    np.testing.assert_array_equal(answers(library, inputs, change), answers(library, inputs))
+
+
+@pytest.fixture(scope="module")
+def solve_in_c(library):
+    """The C program's solution of a QP of one contact a step: x, its residual and status."""
+    words = "cc -std=c99 -O2 -fPIC -shared -o qp.so -lm -I.".split()
+    subprocess.run([*words, HERE / "exported_qp.c"], cwd=library.parent, check=True)
+    drawn = ctypes.CDLL(str(library.parent / "qp.so")).drawn
+
+    def solve(qp):
+        P, q, A, low, high = qp
+        low, high = (bound.reshape(A.shape[:2]) for bound in (low, high))
+        both = [
+            (s * A[:, i], s * b[:, i]) for i in range(A.shape[1]) for s, b in ((1, high), (-1, low))
+        ]
+        sides, bounds = zip(*[side for side in both if np.abs(side[1]).max() < 1e20], strict=True)
+        x, residual = np.zeros(len(q)), np.zeros(1)
+        arrays = (P, q, np.stack(sides, axis=1), np.stack(bounds, axis=1))
+        at = [np.ascontiguousarray(array) for array in arrays]
+        pointers = [ctypes.c_void_p(array.ctypes.data) for array in (*at, x, residual)]
+        status = drawn(*pointers[:4], len(A), *pointers[4:])
+        return x, residual[0], status
+
+    return solve
+
+
+qp_of = jax.jit(partial(layer_qp, CONFIG, ROBOT))
+solved = jax.jit(solve_qp)
+
+
+def assert_same_solution(solve_in_c, qp):
+    ours = solved(qp)
+    x, residual, status = solve_in_c(qp)
+    assert status == ours.status
+    assert (residual <= 1e-8) == (status in (Status.SOLVED, Status.NOT_UNIQUE))
+    if status == Status.SOLVED:
+        column = np.sqrt(np.diag(qp.P))
+        condition = np.linalg.cond(qp.P / column / column[:, None])
+        size = max(np.abs(column * ours.x).max(), 1e-6 * np.abs(qp.q / column).max())
+        assert condition > 1e6 or np.abs(column * (x - ours.x)).max() <= 1e-8 * size
+
+
+@pytest.mark.parametrize("count", [60, pytest.param(2000, marks=pytest.mark.slow)])
+def test_the_qp_in_c_has_our_solution_and_status(solve_in_c, count):
+    problems = draw_problems(CONFIG, ROBOT, count)
+    for i in range(count):
+        assert_same_solution(solve_in_c, QP(*map(np.asarray, qp_of(pick(problems, i)))))
+
+
+def test_hard_qps_have_our_status_too(solve_in_c):
+    """Flat, infeasible, bounds of zero, vertices with more rows than variables, no numbers."""
+    problems, found = draw_problems(CONFIG, ROBOT, 12), []
+    for i in range(12):
+        qp = QP(*map(np.asarray, qp_of(pick(problems, i))))
+        low = np.where(qp.u == 500.0, 1.0, qp.l)
+        flat = np.eye(50)[5 * (i % 10) : 5 * (i % 10) + 2].sum(axis=0) / 2**0.5  # F_x = F_y
+        level = np.eye(50) - np.outer(flat, flat)
+        changes = (
+            {"P": level @ qp.P @ level, "q": level @ qp.q},
+            {"P": level @ qp.P @ level + 1e-10 * np.outer(flat, flat), "q": level @ qp.q},
+            {"P": qp.P - np.diag(np.diag(qp.P))},
+            {"u": np.where(qp.u == 500.0, -1.0, qp.u)},
+            {"l": low, "u": np.where(qp.u == 500.0, 1.0, qp.u)},
+            {"q": 100.0 * np.abs(qp.q)},
+            {"q": np.zeros(50)},
+            {"q": np.where(np.arange(50) == 7, np.nan, qp.q)},
+        )
+        for change in changes:
+            hard = qp._replace(**change)
+            assert_same_solution(solve_in_c, hard)
+            found.append(int(solved(hard).status))
+    assert set(found) == {Status.SOLVED, Status.NOT_UNIQUE, Status.INFEASIBLE, Status.BAD_DATA}
+
+
+def test_the_library_allocates_nothing(library):
+    listed = subprocess.run(["nm", "-u", library], capture_output=True, text=True).stdout
+    assert not {"malloc", "calloc", "realloc", "free"} & set(re.findall(r"\w+", listed))
+    assert "sincos" in listed or "sin" in listed
+
+
+@pytest.mark.slow
+def test_address_and_undefined_behaviour_are_clean_along_the_walk(walked, tmp_path):
+    inputs = inputs_of(walked, ROBOT)
+    inputs.estimate["euler"][700, 1], inputs.estimate["velocity"][800] = np.nan, 1e150
+    compile_controller(source_of(TUNED), tmp_path)
+    for name, part in inputs._asdict().items():
+        part.tofile(tmp_path / name)
+    flags = (
+        "-std=c99 -O1 -g -fsanitize=address,undefined -fno-sanitize-recover -I. controller.c -lm"
+    )
+    words = ["cc", HERE / "exported_walk.c", *flags.split(), "-o", "walk"]
+    subprocess.run(words, cwd=tmp_path, check=True)
+    run = subprocess.run(["./walk", *inputs._fields], cwd=tmp_path, capture_output=True, text=True)
+    assert (run.returncode, run.stderr, np.isfinite(float(run.stdout))) == (0, "", True)
+
+
+def test_weights_that_fall_and_constraints_of_ones_own_are_refused():
     limp = TUNED._replace(Q=jax.tree.map(lambda w: 1e-6 * w, nominal().Q))
     with pytest.raises(ValueError, match="fall"):
-        record(CONFIG, ROBOT, limp, command=named_command("straight"), seconds=0.2)
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    with pytest.raises(ValueError, match="JAX_PLATFORMS=cpu"):
-        export_controller(CONFIG, ROBOT, expert())
+        walk_of(named_command("straight"), 0.2, limp)
+    own = replace(CONFIG, mpc=MpcConfig(costs=(StateCost("low", of=None),)))
+    with pytest.raises(ValueError, match="no costs beside Q and R, got low"):
+        source_of(TUNED, own)
 
 
 # The command
@@ -309,37 +465,55 @@ def run(tmp_path):
     return save_run(tmp_path)
 
 
-def test_the_command_writes_files_that_run_without_us(capsys, exported, tmp_path):
+def test_the_command_writes_files_that_run_without_us(capsys, exported):
     card, folder = exported
-    files = (
-        "check.npz controller-cpu.jaxexport controller-cuda.jaxexport controller.json weights.cpp "
-    )
-    files += "weights.json weights.schema.json"
-    assert sorted(path.name for path in folder.glob("[!.]*")) == files.split()
+    files = "check.npz controller.c controller.h controller.json weights.cpp weights.json "
+    assert sorted(path.name for path in folder.glob("[!.]*")) == (files + SCHEMA).split()
     assert json.loads((folder / "controller.json").read_text()) == card
-    assert card["check"]["force"] <= TOLERANCE
-    assert card["check"]["plan_ms"]["p50"] > 0.0
+    assert card["check"]["force"] <= 1e-8
+    assert 0.0 < card["check"]["hold_ms"]["p50"] < card["check"]["plan_ms"]["p50"]
+    assert card["sha256"]["weights.json"] in (folder / "controller.h").read_text()
     schema = json.loads((folder / SCHEMA).read_text())
     jsonschema.Draft202012Validator.check_schema(schema)
     jsonschema.validate(json.loads((folder / "weights.json").read_text()), schema)
     jax.tree.map(np.testing.assert_array_equal, load_weights(folder / "weights.json"), TUNED)
+    runpy.run_path(str(EXAMPLES / "check.py"))["main"](folder)
+    said = capsys.readouterr().out
+    assert "1200 calls" in said
+    assert float(re.search(r"difference (\S+) N m", said)[1]) <= 1e-8
 
-    spec = importlib.util.spec_from_file_location("run_exported", EXAMPLE)
-    example = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(example)
-    example.main(folder)
-    assert "1200 calls" in capsys.readouterr().out
-    changed = shutil.copytree(folder, tmp_path / "changed")
-    (changed / "controller-cpu.jaxexport").write_bytes(b"another")
-    with pytest.raises(SystemExit, match="does not have the sha256"):
-        example.main(changed)
+
+def test_the_c_program_walks_the_robot_in_mujoco(exported, tmp_path):
+    """As its comment compiles it: one and a half seconds, ahead and to the left."""
+    code, home = (EXAMPLES / "walk.c").read_text(), Path(mujoco.__path__[0])
+    if not list(home.glob("libmujoco.so*")):
+        pytest.skip("this MuJoCo has no libmujoco.so")
+    line = re.search(r"^ \*     (cc .*)$", code, re.MULTILINE)[1]
+    for name, value in {"FOLDER": exported[1], "$M": home, "walk.c": EXAMPLES / "walk.c"}.items():
+        line = line.replace(name, str(value))
+    subprocess.run(line, shell=True, cwd=tmp_path, check=True)
+    words = ["./walk", ROBOT.description.model, "1.5"]
+    said = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    x, y, z, yaw, unsolved = map(float, re.findall(r"-?\d+(?:\.\d+)?", said))
+    assert 0.3 < x < 0.6
+    assert 0.0 < y < 0.4
+    assert (z, yaw) == pytest.approx((ROBOT.standing_height, 0.75), abs=0.2)
+    assert unsolved == 0
+
+
+def test_without_a_compiler_the_files_are_written_and_a_line_says_so(monkeypatch, capsys, run):
+    for module in (export, check):
+        monkeypatch.setattr(module, "compiler", lambda: None)
+    assert call(monkeypatch, run, "--seconds", "0.1") == 0
+    assert "no C compiler (cc): the check of controller.c did not run" in capsys.readouterr().err
+    assert json.loads((run / "export" / "controller.json").read_text())["check"] is None
 
 
 def test_what_differs_from_the_live_controller_is_not_written(monkeypatch, capsys, run):
-    for part in ("export_controller", "record", "load_controller"):
+    for part in ("record", "compile_controller"):
         instead(monkeypatch, export, part, lambda *args, **named: None)
     for difference, fault in (({"force": 2e-6}, "2.0e-06 N"), ({"unsolved": 3}, "3 QPs were not")):
-        found = Check(0.0, 0.0, 0.0, 0, {}, {})._replace(**difference)
+        found = check.Check(0.0, 0.0, 0.0, 0, {}, {})._replace(**difference)
         instead(monkeypatch, export, "compare_with_live", lambda *known, found=found: found)
         assert call(monkeypatch, run) == 1
         assert fault in capsys.readouterr().err

@@ -16,13 +16,8 @@ from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal
 from hector_jax.control.weights_file import load_weights, save_weights
-from hector_jax.export.controller import compare_with_live, record
-from hector_jax.export.export import (
-    TOLERANCE,
-    controller,
-    export_controller,
-    load_controller,
-)
+from hector_jax.export.check import compare_with_live, compile_controller, compiler, record
+from hector_jax.export.source import controller_source
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.effect import last_command
 from hector_jax.importing.remarks import differences
@@ -30,7 +25,7 @@ from hector_jax.robot.model import load_robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import walk
-from hector_jax.sim.world import hfs
+from hector_jax.sim.world import hfs, ideal
 from hector_jax.tuning.rollout import RolloutConfig, Scenario
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -170,13 +165,13 @@ def test_both_engines_walk_alike(robot):
 
 
 @both
-def test_the_exported_controller_answers_as_the_live_one(robot):
+@pytest.mark.skipif(compiler() is None, reason="there is no C compiler")
+def test_the_controller_in_c_answers_as_the_live_one(robot, tmp_path):
     config, weights = walk_config(robot), nominal(robot)
-    example = controller(config, robot, weights)[1]
-    loaded = load_controller(export_controller(config, robot, weights)), example
-    walked = record(config, robot, weights, command=named_command("s"), seconds=0.4)
-    found = compare_with_live(config, *loaded, walked)
-    assert max(found.force, found.moment, found.torque) <= TOLERANCE
+    source = controller_source(config, robot, weights, name="nominal", content=b"")
+    walked = record(config, robot, Job(weights, named_command("s"), ideal(robot.description), 0.4))
+    found = compare_with_live(config, robot, compile_controller(source, tmp_path), walked)
+    assert max(found.force, found.moment, found.torque) <= 1e-8
     assert found.unsolved == 0
 
 

@@ -245,13 +245,15 @@ def run_export(args: flags.Export) -> None:
             name=name,
             seconds=args.seconds,
         )
-    print_result(args.json, card, lambda: _print_check(card["check"]))
+    print_result(args.json, card, lambda: _print_check(card["check"] or {}))
     say(f"the export is in {folder}")
 
 
 def _print_check(check: Mapping[str, Any]) -> None:
+    if not check:
+        return
     differences = "{force:.1e} N, {moment:.1e} N m, {torque:.1e} N m at the joints"
     print(f"largest difference from the live controller: {differences.format(**check)}")
-    times = "p50 {p50:.2f}, p99 {p99:.2f}, max {max:.2f}; CPU {cpu_p50:.2f}, {cpu_p99:.2f}"
+    times = "p50 {p50:.3f}, p99 {p99:.3f}, p99.9 {p999:.3f}, max {max:.3f}"
     for key, text in (("plan_ms", "with a plan"), ("hold_ms", "between plans")):
-        print(f"a call {text} [ms]: {times.format(**check[key])}")
+        print(f"CPU time of a call {text} [ms]: {times.format(**check[key])}")

@@ -353,7 +353,7 @@ class Doctor(Printed):
 
 @_command
 class Export(Printed):
-    """Export weights, lines for the open C++ controller, and the compiled controller.
+    """Export weights, lines for the open C++ controller, and the controller as C.
 
     Example: hector export latest
     """

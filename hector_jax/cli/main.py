@@ -33,7 +33,7 @@ def _run() -> None:
     warnings.showwarning = lambda message, *where, **_: say_once(f"warning: {message}")
     try:
         with say_if_slow("loading JAX and MuJoCo"):
-            start_jax(on_cpu=isinstance(args, Export))  # an export refuses a GPU
+            start_jax(on_cpu=isinstance(args, Export))  # a walk is quicker there
             with outside_packages():  # after the flags: `hector --help` answers at once
                 from hector_jax.cli import commands
     except InputError as error:

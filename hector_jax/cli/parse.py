@@ -26,7 +26,7 @@ OVERVIEW = {
     "What you type first": {
         "tune": "tune weights for a trajectory, evaluate them, write a report",
         "view": "show a run in the browser, before and after: hector view latest",
-        "export": "write weights, lines for C++, the compiled controller: hector export latest",
+        "export": "write weights, lines for C++, the controller as C: hector export latest",
         "robot": "make the file of your own robot from its MJCF or URDF",
         "walk": "walk once; errors in cm and degrees, and a film with --video",
         "evaluate": "compare weight sets on simulated robots",

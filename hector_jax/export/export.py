@@ -1,11 +1,12 @@
-"""Export for the robot: the weights with their schema, and the controller as a compiled function.
+"""Export for the robot: the weights with their schema, and the controller as C.
 
-A recorded walk with the outputs of the live controller lies beside the file; nothing is written
-unless the exported function returns the same outputs (`TOLERANCE`).
+A recorded walk with the outputs of the live controller lies beside the files; where there is a C
+compiler, nothing is written unless the compiled controller returns the same outputs (`TOLERANCE`).
 """
 
 import hashlib
 import io
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -17,29 +18,29 @@ from hector_jax.control.mpc import input_weights
 from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights, nominal
-from hector_jax.control.weights_file import WEIGHTS, save_weights, weights_tree
-from hector_jax.core.console import Broken
+from hector_jax.control.weights_file import WEIGHTS, weights_tree
+from hector_jax.core.console import Broken, say
 from hector_jax.core.environment import versions
-from hector_jax.core.files import make_folder, write_file, write_json
+from hector_jax.core.files import as_json, make_folder, write_file, write_json
 from hector_jax.core.inputs import InputError, plural, unknown
 from hector_jax.core.settings import Range, from_table, read_json, to_table
 from hector_jax.core.tree_file import tree_hash
-from hector_jax.export.controller import (
+from hector_jax.export.check import (
     Check,
+    WalkRecord,
     as_arrays,
     compare_with_live,
-    controller,
-    export_controller,
-    load_controller,
+    compile_controller,
+    compiler,
     record,
-    signature,
 )
+from hector_jax.export.source import controller_source
 from hector_jax.robot.model import Robot
-from hector_jax.sim.loop import substeps
+from hector_jax.sim.loop import Job
+from hector_jax.sim.world import ideal
 from hector_jax.store.folder import CONFIG
 
 SCHEMA = "weights.schema.json"
-PLATFORMS = ("cpu", "cuda")
 TOLERANCE = 1e-6
 """Largest difference [N, N m] from the live controller."""
 
@@ -91,30 +92,31 @@ def controller_of_run(run: Path) -> WalkConfig:
     return from_table(f"{path}: tune.rollout.walk", WalkConfig, table)
 
 
-def _constants(config: WalkConfig, robot: Robot, lead: int) -> dict[str, Any]:
-    """Return numbers that the code of the robot needs."""
-    return {
-        "milliseconds_per_plan": substeps(config),
-        "millisecond_of_tick_0": lead,
-        "joint_names": list(robot.description.joints),
-        "standing_joints": robot.standing_joints.tolist(),
-        "standing_height": float(robot.standing_height),
-        "com_offset": robot.com_offset.tolist(),
-        "torque_limit": robot.torque_limit.tolist(),
-    }
-
-
 def _require_same(result: Check) -> None:
-    """Raise `Broken` if the exported controller differs from the live one or fails to solve."""
+    """Raise `Broken` if the compiled controller differs from the live one or fails to solve."""
     if not max(result[:3]) <= TOLERANCE:
         raise Broken(
-            f"the exported controller differs from the live one by {result.force:.1e} N, "
+            f"the compiled controller differs from the live one by {result.force:.1e} N, "
             f"{result.moment:.1e} N m and {result.torque:.1e} N m at the joints, at most "
             f"{TOLERANCE:g} was expected; nothing was written"
         )
     if result.unsolved:
         what = plural(result.unsolved, "QP") + (" was" if result.unsolved == 1 else " were")
         raise Broken(f"{what} not solved on the walk of the check; nothing was written")
+
+
+def _checked(
+    config: WalkConfig, robot: Robot, source: dict[str, str], recorded: WalkRecord
+) -> dict[str, Any] | None:
+    """Compile the source, compare it with the live controller; None without a compiler."""
+    if compiler() is None:
+        say("there is no C compiler (cc): the check of controller.c did not run")
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        library = compile_controller(source, Path(folder))
+        result = compare_with_live(config, robot, library, recorded)
+    _require_same(result)
+    return {"milliseconds": len(recorded.torque), **result._asdict()}
 
 
 def export(
@@ -136,42 +138,41 @@ def export(
         name: name of the weights, for the files.
 
     Returns:
-        The card, also in `controller.json`: sha256 of the files, signature, constants, weights,
-        settings and the check.
+        The card, also in `controller.json`: sha256 of the files, weights, settings and the check,
+        which is None if there is no C compiler.
 
     Raises:
-        InputError: see `record` and `export_controller`; or the folder cannot be written.
-        Broken: the exported controller differs from the live one by more than TOLERANCE, or a QP
+        InputError: see `record` and `controller_source`; or the folder cannot be written.
+        Broken: the compiled controller differs from the live one by more than TOLERANCE, or a QP
             of the check was not solved; nothing is written.
     """
     make_folder(folder)
-    blobs = {p: export_controller(config, robot, weights, platform=p) for p in PLATFORMS}
-    recorded = record(config, robot, weights, command=command, seconds=seconds)
-    _, example = controller(config, robot, weights)
-    result = compare_with_live(config, load_controller(blobs["cpu"]), example, recorded)
-    _require_same(result)
+    weights_json = (as_json({"$schema": SCHEMA} | weights_tree(weights), indent=2) + "\n").encode()
+    source = controller_source(
+        config, robot, weights, name=name, content=weights_json, pieces=len(command.duration)
+    )
+    job = Job(weights, command, ideal(robot.description), seconds)
+    recorded = record(config, robot, job)
+    check = _checked(config, robot, source, recorded)
     # the card has the hashes of the other files: it is removed first and written last
     (folder / "controller.json").unlink(missing_ok=True)
-    save_weights(folder / "weights.json", weights, SCHEMA)
-    write_json(folder / SCHEMA, weights_schema(robot))
     np.savez(archive := io.BytesIO(), **as_arrays(recorded))
-    contents = {f"controller-{platform}.jaxexport": blob for platform, blob in blobs.items()}
+    contents = {file: text.encode() for file, text in source.items()}
+    contents["weights.json"] = weights_json
+    contents[SCHEMA] = (as_json(weights_schema(robot), indent=2) + "\n").encode()
     if len(robot.foot_point) == 2:  # the C++ controller is for bipeds
         contents["weights.cpp"] = weights_cpp(weights, config, robot, name=name).encode()
     contents["check.npz"] = archive.getvalue()
     for file, content in contents.items():
         write_file(folder / file, content)
-    files = (*contents, "weights.json", SCHEMA)
     card = {
         "name": name,
-        "sha256": {f: hashlib.sha256((folder / f).read_bytes()).hexdigest() for f in files},
-        "signature": signature(example),
-        "constants": _constants(config, robot, recorded.lead),
+        "sha256": {file: hashlib.sha256(x).hexdigest() for file, x in contents.items()},
         "weights": weights_tree(weights),
         "controller": to_table(config),
         "robot": tree_hash(robot),
         "versions": versions(),
-        "check": {"milliseconds": len(recorded.torque), **result._asdict()},
+        "check": check,
     }
     write_json(folder / "controller.json", card)
     return card

@@ -1,0 +1,231 @@
+"""The controller as C: `controller.c` and `controller.h` from a configuration and a robot.
+
+The templates are the C program: vectors, gait, reference, torques and interface in `controller`,
+then `legs`, `qp` and `mpc`. What is filled in are sizes, tables and the constraints in use.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from hector_jax.control.controller import WalkConfig
+from hector_jax.control.footstep import FootstepConfig
+from hector_jax.control.parameters import TUNABLES
+from hector_jax.control.twin import TwinConfig
+from hector_jax.control.weights import Weights
+from hector_jax.control.weights_file import WEIGHTS
+from hector_jax.core.geometry import inverse
+from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import FEET
+from hector_jax.robot.kinematics import NEWTON_STEPS
+from hector_jax.robot.model import Robot
+from hector_jax.sim.loop import first_tick, substeps
+
+# Sides of a contact by constraint, as C: coefficients of (F_x, F_y, F_z, M_x, M_y, M_z), each F in
+# the world and M in the foot's frame, of which the sum is at most a seventh number, zero by
+# default. The formulas are those of `control.contact`; cs and sn are of the foot's yaw.
+_SIDES = {
+    "friction": ["1, 1, -mu", "-1, -1, -mu", "1, -1, -mu", "-1, 1, -mu"],
+    "unilateral_force": ["0, 0, -1", "0, 0, 1, 0, 0, 0, MAX_FORCE"],
+    "line_pressure": ["0, 0, -TOE, 0, -1", "0, 0, -HEEL, 0, 1"],
+    "line_friction": [
+        "-HEEL * sn, HEEL * cs, -grip * HEEL, 0, grip, 1",
+        "HEEL * sn, -HEEL * cs, -grip * HEEL, 0, grip, -1",
+        "-TOE * sn, TOE * cs, -grip * TOE, 0, -grip, -1",
+        "TOE * sn, -TOE * cs, -grip * TOE, 0, -grip, 1",
+    ],
+    "side_pressure": [f"0, 0, -HALF_WIDTH, {s}" for s in (1, -1)],
+    "torsion": [f"0, 0, -0.5 * grip * DIAGONAL, 0, 0, {s}" for s in (1, -1)],
+    "corner_friction": [
+        *("cs, sn, -inner", "-cs, -sn, -inner", "-sn, cs, -inner", "sn, -cs, -inner"),
+        *(
+            f"{a} * HALF_WIDTH * cs - ({b} * HALF_LENGTH - {s} * MIDDLE) * sn, "
+            f"{a} * HALF_WIDTH * sn + ({b} * HALF_LENGTH - {s} * MIDDLE) * cs, "
+            f"inner * ({s * b} * MIDDLE - HALF_LENGTH - HALF_WIDTH), "
+            f"{s * a} * inner, {s * b} * inner, {s}"
+            for a, b, s in product((1, -1), repeat=3)
+        ),
+    ],
+}
+_COMPONENTS = ("F_x", "F_y", "F_z", "M_x", "M_y", "M_z")
+PIECES = 16  # of a command, at least
+_TEMPLATES = Environment(
+    loader=FileSystemLoader(Path(__file__).parent / "templates"),
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+)
+
+
+def controller_source(
+    config: WalkConfig,
+    robot: Robot,
+    weights: Weights,
+    *,
+    name: str,
+    content: bytes,
+    pieces: int = 0,
+) -> dict[str, str]:
+    """Return `controller.c` and `controller.h` by their names.
+
+    Args:
+        config, robot, weights: the controller.
+        name: of the weights, for the first line.
+        content: of the weights file, whose sha256 is in the header.
+        pieces: of a command, if more than PIECES.
+
+    Raises:
+        InputError: constraints or costs of one's own, which are Python; or a twin.
+    """
+    mpc, footsteps = config.mpc, FootstepConfig()
+    ours = footsteps.travel, footsteps.ahead
+    if config.twin != TwinConfig() or (config.footstep.travel, config.footstep.ahead) != ours:
+        raise InputError("a twin of another controller is not exported: that controller walks")
+    constraints = [part.name for part in (*mpc.on("inputs"), *mpc.on("states"))]
+    own = [part for part in constraints if part not in _SIDES] + [c.name for c in mpc.costs]
+    if own:
+        text = f"the C controller has the constraints {', '.join(_SIDES)} and no costs beside Q and"
+        raise InputError(f"{text} R, got {', '.join(own)}")
+    sides = [side for part in constraints for side in _SIDES[part]]
+    values = {
+        "title": f"{robot.description.name} with the weights {name}".replace("*/", "* /"),
+        "sha256": hashlib.sha256(content).hexdigest(),
+        "feet": FEET[len(robot.foot_point)],
+        "joints": robot.description.joints,
+        "com": robot.com_offset,
+        "height": float(robot.standing_height),
+        "pieces": max(pieces, PIECES),
+        "period": substeps(config),
+        "lead": -first_tick(config) * substeps(config),
+        "sides": sides,
+        "moments": max(mpc.contact.components) > 2,
+        "footholds": config.footstep.rule,
+        "closed_form": robot.structure.closed_form,
+        "sizes": _sizes(config, len(sides)),
+        "numbers": _numbers(config, robot),
+        "tables": _tables(config, robot),
+        "tunables": dict(_tunables(config, robot, weights)),
+    }
+    return {f: _TEMPLATES.get_template(f"{f}.j2").render(c=_c, **values) for f in FILES}
+
+
+FILES = ("controller.h", "controller.c")
+
+
+def _c(value: Any) -> str:
+    """Return a value as C writes it, numbers to the last bit and arrays as an initialiser."""
+    if isinstance(value, str):
+        return json.dumps(value)
+    if np.ndim(value):
+        return "{ " + ", ".join(map(_c, value)) + " }"
+    return "INFINITY" if value == np.inf else repr(np.asarray(value).item())
+
+
+def _numbers(config: WalkConfig, robot: Robot) -> dict[str, Any]:
+    """Return the numbers of controller and robot, in SI units and in ticks."""
+    gait, mpc, slip = config.gait, config.mpc, config.slip
+    return {
+        "TICK": gait.tick,
+        "STANCE": gait.stance,
+        "SWING": gait.swing,
+        "CYCLE": gait.cycle,
+        "BEGIN": first_tick(config),
+        "FIRST_TICK": gait.first_tick,
+        "STEPS": mpc.horizon,
+        "STEP_TICKS": mpc.step_ticks,
+        "DT": config.mpc_step,
+        "MASS": robot.mass,
+        "MAX_FORCE": mpc.max_force,
+        "TOE": robot.toe,
+        "HEEL": robot.heel,
+        "MIDDLE": 0.5 * (robot.toe - robot.heel),
+        "HALF_LENGTH": (half := 0.5 * (robot.toe + robot.heel)),
+        "HALF_WIDTH": (width := mpc.sole_width * robot.half_width),
+        "DIAGONAL": np.hypot(half, width),
+        "SLIP_DISTANCE": slip.distance * robot.standing_height,
+        "SLIP_LOSS": 1.0 - slip.share,
+        "RECOVERY": slip.recovery,
+        "PLACED": len(robot.structure.placed),
+        "NEWTON_STEPS": NEWTON_STEPS,
+        "TOLERANCE": mpc.qp.tolerances(jnp.dtype(float)).residual,
+    }
+
+
+def _tables(config: WalkConfig, robot: Robot) -> dict[str, Any]:
+    """Return the arrays of controller and robot, joints leg by leg."""
+    structure, gait, count = robot.structure, config.gait, len(robot.foot_point)
+    axes, inertia = robot.joint_axis, config.mpc.planned_inertia(robot.inertia)
+    tables = {
+        "LEAD": np.rint(gait.cycle * np.array(gait.offsets)).astype(int),
+        "COMPONENT": np.array(config.mpc.contact.components),
+        "GRAVITY": robot.gravity,
+        "INVERSE_INERTIA": np.asarray(inverse(jnp.asarray(inertia))),
+        "COM": robot.com_offset,
+        "FOOT_AHEAD": robot.foot_ahead,
+        "ORIGIN": robot.joint_origin,
+        # the closed form takes its axes as exact
+        "AXIS": np.round(axes) if structure.closed_form else axes,
+        "FOOT_POINT": robot.foot_point,
+        "SOLE": robot.sole,
+        "LINK_MASS": robot.link_mass,
+        "LINK_COM": robot.link_com,
+        "LOWER": robot.joint_lower.reshape(count, -1),
+        "UPPER": robot.joint_upper.reshape(count, -1),
+        "TORQUE_LIMIT": robot.torque_limit,
+        "STANDING": robot.standing_joints.reshape(count, -1),
+        "PLACED_ROW": np.array(structure.placed),
+    }
+    unused = ("STANDING", "PLACED_ROW") if structure.closed_form else ()
+    unused += ("FOOT_AHEAD",) if config.footstep.rule == "paper" else ()
+    return {name: table for name, table in tables.items() if name not in unused}
+
+
+def _sizes(config: WalkConfig, sides: int) -> dict[str, Any]:
+    """Return the sizes of the QP, and what it costs."""
+    feet, steps, model = len(config.gait.offsets), config.mpc.horizon, config.mpc.contact
+    contacts, usual = steps * feet, steps * config.gait.most_contacts * model.inputs
+    variables, limit = contacts * model.inputs, 100 + 6 * usual
+
+    def millions(n: int, active: int, changes: int) -> float:
+        """Return multiplications: factorisations, and the changes of the active set."""
+        change = 6 * n * n + 9 * n * active + 6 * active**2 + 2 * contacts * sides * model.inputs
+        return 1e-6 * (2 * n**3 + changes * change)
+
+    return {
+        "contacts": contacts,
+        "inputs": model.inputs,
+        "components": ", ".join(_COMPONENTS[i] for i in model.components),
+        "sides": sides,
+        "variables": variables,
+        "limit": limit,
+        "usual": round(millions(usual, usual // 5, usual // 5), 1),
+        "most": round(millions(variables, variables, limit)),
+    }
+
+
+def _tunables(
+    config: WalkConfig, robot: Robot, weights: Weights
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the names of the tunables with the exported values and their bounds.
+
+    The bounds are those of a weights file, and further out if the exported value is.
+    """
+    parameters = jax.tree.map(np.asarray, config.parameters(weights))
+    named = {"Q": np.concatenate(weights.Q), "R_force": weights.R.force}
+    named |= {"R_moment": weights.R.moment} if weights.R.moment.size else {}
+    named |= {name: tunable.read(parameters) for name, tunable in TUNABLES.items()}
+    for name, value in named.items():
+        box = TUNABLES.get(name)
+        low, high = (box.lower, box.upper) if box else (WEIGHTS.low, WEIGHTS.high)
+        value = np.asarray(value, float)
+        edges = np.minimum(value, low), np.maximum(value, high)
+        yield name, dict(zip(("exported", "lower", "upper"), (value, *edges), strict=True))
