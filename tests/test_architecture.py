@@ -21,7 +21,7 @@ DOORS |= {"optax": ("grfm.nets", "tuning.difftune", "tuning.step_rules", "search
 DOORS |= {"jaxopt": ("qp.jaxopt_solver",), "cmaes": ("search.",), "tinygp": ("search.few_walks",)}
 DOORS |= {
     "matplotlib": ("report.plots",),
-    "jinja2": ("report.report", "export.source"),
+    "jinja2": ("report.report", "export.source", "export.template"),
     "tyro": ("cli.parse",),
 }
 DOORS |= dict.fromkeys(("cma", "botorch", "torch"), ())

@@ -5,7 +5,7 @@ worlds call `step_plan` and `actuate` with measurements. The controller knows on
 robot, never the parameters of the plant.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from hector_jax import qp
 from hector_jax.control import footstep, gait, legs
 from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance, integrate_error
 from hector_jax.control.footstep import Feet, FootstepConfig, FootstepParameters
@@ -32,6 +31,7 @@ from hector_jax.core.geometry import rotation_from_euler, wrap_angle
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import check, from_table
 from hector_jax.core.trajectory import State, Wrench
+from hector_jax.qp import Solution
 from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
@@ -271,24 +271,23 @@ def plan(
     body = config.twin.body(robot)
     problem = MpcProblem(body, parameters.mpc, state, horizon, disturbance)
     contact, swing_ticks = gait.contact(config.gait, tick), gait.swing_ticks(config.gait, tick)
-
-    def solve() -> tuple[Wrench, Float[Array, ""], Int[Array, ""]]:
-        wrench, solution = solve_mpc(
-            config.mpc, problem, dt=config.mpc_step, max_contacts=max_contacts
-        )
-        residual = jnp.maximum(solution.primal_residual, solution.dual_residual)
-        return wrench, jnp.maximum(residual, solution.gap), solution.status
-
-    if last is None or every == 1:
-        solved = solve()
-    else:
-        kept = jax.tree.map(jnp.asarray, (last, 0.0, qp.Status.SOLVED))
-        kept = jax.tree.map(lambda x, like: x.astype(like.dtype), kept, jax.eval_shape(solve))
-        solved = jax.lax.cond(tick % every == 0, solve, lambda: kept)
-    wrench, residual, status = solved
+    solve = partial(solve_mpc, config.mpc, problem, dt=config.mpc_step, max_contacts=max_contacts)
+    held = last is not None and every > 1
+    wrench, solution = _solve_or_keep(solve, last, tick % every == 0) if held else solve()
+    residual = jnp.maximum(solution.primal_residual, solution.dual_residual)
+    residual = jnp.maximum(residual, solution.gap)
     if config.twin != TwinConfig():  # a foot in the air exerts nothing
         wrench = jax.tree.map(lambda x: contact[:, None] * x, wrench)
-    return Plan(wrench, contact, touchdown, swing_ticks, residual, status), disturbance
+    return Plan(wrench, contact, touchdown, swing_ticks, residual, solution.status), disturbance
+
+
+def _solve_or_keep(
+    solve: Callable[[], tuple[Wrench, Solution]], last: Wrench | None, now: Bool[Array, ""]
+) -> tuple[Wrench, Solution]:
+    """Return a new plan, or between plans the last wrench with the solution of a solved QP."""
+    like, zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(solve))
+    kept = jax.tree.map(lambda wrench, x: wrench.astype(x.dtype), last, like)
+    return jax.lax.cond(now, solve, lambda: (kept, zero))
 
 
 def measured_feet(robot: Robot, measurement: Measurement) -> Feet:
