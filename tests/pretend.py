@@ -34,6 +34,16 @@ def call(monkeypatch, *words):
     return main()
 
 
+def refused(monkeypatch, capsys, *words):
+    """Run a line that must be refused; the one line that is said of it."""
+    assert call(monkeypatch, *words) == 2
+    out, err = capsys.readouterr()
+    (line,) = [line for line in err.splitlines() if line.startswith("hector:")]
+    assert "Traceback" not in out + err
+    assert out == ""
+    return line
+
+
 def pretend_walk(seed=0, error=0.03, seconds=4.0, period=0.01, fall_at=None, turn=0.0):
     """A walk at 0.5 m/s that sways about its reference by `error` [m]; numpy arrays."""
     rng = np.random.default_rng(seed)

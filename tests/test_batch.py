@@ -25,7 +25,6 @@ from hector_jax.tuning.batch import (
     PER_CALL,
     BatchProblem,
     BatchScenario,
-    choose_rollout,
     tail_weights,
     tune_batch,
 )
@@ -164,13 +163,6 @@ def test_the_mean_of_scenarios_is_tuned_by_the_mean_of_their_matrices(on_toy):
 def test_the_tail_is_the_mean_over_the_worst_share(tail, expected):
     found = tail_weights(jnp.array([2.0, 9.0, 5.0, 1.0]), jnp.asarray(tail))
     np.testing.assert_allclose(found, expected)
-
-
-def test_a_gpu_walks_the_ticks_of_few_rollouts_at_once():
-    config = RolloutConfig(ticks=350, lead=50)
-    assert choose_rollout("gpu", config, 8) is parallel_rollout
-    assert choose_rollout("gpu", config, 9) is rollout
-    assert choose_rollout("cpu", config, 1) is rollout
 
 
 DEVICES = """

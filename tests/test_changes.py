@@ -13,7 +13,6 @@ from changes import Change, ChangingPlant, changed_world, walk_with_changes, wor
 from pretend import instead, pretend_walk
 from test_walk import walk_and_gain
 
-from hector_jax.control import gait
 from hector_jax.control.controller import WalkConfig, walk_config
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import named_command
@@ -139,12 +138,6 @@ def test_the_friction_grows_back_within_the_time_of_recovery():
     assert shares[4] == 0.4
     np.testing.assert_allclose(np.diff(shares[4:64]), 0.6 * GAIT.tick / 0.6)
     assert np.all(shares[65:] == 1.0)
-
-
-def test_a_stance_begins_at_the_touchdown_or_the_start_of_the_gait():
-    since = gait.since_touchdown(GAIT, jnp.array([GAIT.first_tick - 5, GAIT.first_tick + 1, 0, 23]))
-    np.testing.assert_array_equal(since[:, 0], [0, 1, 0, 23])
-    np.testing.assert_array_equal(since[:, 1], [0, 1, 20, 3])
 
 
 @pytest.mark.slow

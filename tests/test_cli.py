@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from model import BEST_OTHERS
-from pretend import call, instead
+from pretend import call, instead, refused
 from synthetic import synthetic_walk
 
 from hector_jax.cli import arguments, doctor
@@ -24,16 +24,6 @@ from hector_jax.store import nets, tunings
 from hector_jax.store.nets import CollectConfig
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
-
-
-def refused(monkeypatch, capsys, *arguments):
-    """Runs a command that must be refused; its one line."""
-    assert call(monkeypatch, *arguments) == 2
-    out, err = capsys.readouterr()
-    lines = [line for line in err.splitlines() if line.startswith("hector:")]
-    assert len(lines) == 1, err
-    assert "Traceback" not in out + err
-    return lines[0]
 
 
 def test_help_opens_with_what_is_typed_first_and_names_each_command_once():
@@ -77,13 +67,10 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
 @pytest.mark.parametrize(
     ("words", "fault"),
     [
-        ("walk --seconds 0", "--seconds must be a number from 0.01 to 600, got 0.0"),
         ("walk --weights exprt", "'exprt'; did you mean 'expert'?"),
         ("tune --traj circle", "straight, c, s"),
-        ("tune --start none.json", "none.json"),
         ("collect --seconds 0.001", "at least 0.03 s, the 3 ticks of one sample, got 0.001"),
         ("collect --walks 2", "at least 3"),
-        ("collect --out file/walks", "file"),
         ("search --budget 9", "budget"),
     ],
 )
@@ -91,9 +78,8 @@ def test_wrong_input_is_one_line_before_anything_is_computed(
     monkeypatch, capsys, tmp_path, words, fault
 ):
     monkeypatch.chdir(tmp_path)
-    Path("file").write_text("")
     assert fault in refused(monkeypatch, capsys, *words.split())
-    assert [path.name for path in tmp_path.glob("[!.]*")] == ["file"]
+    assert not list(tmp_path.glob("[!.]*"))
 
 
 def test_a_robot_without_a_best_set_says_so(monkeypatch, capsys, tmp_path):

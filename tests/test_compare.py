@@ -1,12 +1,10 @@
 """Finished runs side by side."""
 
 import json
-import sys
 
 import pytest
-from pretend import pretend_history
+from pretend import call, pretend_history
 
-from hector_jax.cli import main as cli
 from hector_jax.cli.flags import Tune
 from hector_jax.cli.parse import as_table
 from hector_jax.core.files import write_json
@@ -47,8 +45,7 @@ def runs(tmp_path):
 
 
 def test_a_comparison_tells_losses_falls_iterations_and_what_differs(monkeypatch, capsys, runs):
-    monkeypatch.setattr(sys, "argv", ["hector", "compare", *map(str, runs), "--json"])
-    assert cli.main() == 0
+    assert call(monkeypatch, "compare", *runs, "--json") == 0
     out, err = capsys.readouterr()
     assert err == ""
     told = json.loads(out)  # and nothing else

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from synthetic import CYCLE, synthetic_walk, turn_walk, turns
 
-from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
+from hector_jax.control.weights import nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.tree import stack
 from hector_jax.grfm.dataset import at_interval, make_dataset, with_mirror
 from hector_jax.grfm.effect import HISTORY, turn
@@ -44,30 +44,6 @@ def test_jobs_take_turns_and_a_longer_list_begins_with_the_shorter():
     assert [np.ptp(job.command.yaw_rate) > 0 for job in short] == [False, False, True, True] * 2
     other = draw_jobs(4, 1)[0]
     assert not np.array_equal(other.weights.Q.euler, short[0].weights.Q.euler)
-
-
-def test_drawn_weights_lie_within_a_third_and_three_times_of_their_centres():
-    jobs = draw_jobs(0, 64)
-    centres = [(nominal(), expert())[i // len(KINDS) % 2] for i in range(64)]
-    drawn, about = (
-        np.log([np.asarray(weights_to_vector(w)) for w in sets])
-        for sets in ([job.weights for job in jobs], centres)
-    )
-    assert np.abs(drawn - about).max() < np.log(3.001)
-    assert np.all((drawn - about).std(axis=0) > 0.1)
-
-
-def test_a_third_of_the_walks_is_pushed_once_or_twice():
-    pushes = [job.push for job in draw_jobs(0, 300)]
-    size = np.array([np.linalg.norm(push.force, axis=1) for push in pushes])
-    number = (size > 0.0).sum(axis=1)
-    assert 0.25 < np.mean(number > 0) < 0.42
-    assert set(number) == {0, 1, 2}
-    assert size[size > 0.0].min() >= 10.0
-    assert size.max() <= 30.0
-    for push in pushes:
-        assert np.all((push.start >= 0.0) & (push.start + push.duration <= 4.0))
-        assert not push.force[:, 2].any()
 
 
 def test_weights_on_the_log_lines_of_tuning_paths_are_walked_where_paths_are_given():

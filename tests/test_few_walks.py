@@ -103,13 +103,6 @@ def test_a_model_that_repeats_itself_gives_way_to_the_surrogate_nearby():
     assert not needs_model([*history, walked(proposal, 0.1)])
 
 
-def test_a_proposal_follows_from_the_history_alone(history):
-    for count in (1, 8, 15, 19):
-        again = propose(SPACE, history[:count], model)
-        np.testing.assert_array_equal(again.point, history[count].point)
-        assert again.predicted == history[count].predicted
-
-
 def test_proposals_stay_in_the_box():
     narrow = SPACE._replace(box=np.tile([-0.1, 0.1], (SIZE, 1)))
     history = []

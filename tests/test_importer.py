@@ -1,7 +1,6 @@
 """What `hector robot` finds, says and proposes of files that others write."""
 
 import re
-import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -9,9 +8,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from pretend import call
 from published import JOINTS, small
 
-from hector_jax.cli.main import main
 from hector_jax.control.controller import walk_config
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import as_toml
@@ -47,11 +46,6 @@ def told(path):
     proposal = propose_robot(path)
     assert proposal.error is None
     return remarks(proposal.robot)
-
-
-def command(monkeypatch, *words):
-    monkeypatch.setattr(sys, "argv", ["hector", "robot", *map(str, words)])
-    return main()
 
 
 THIGH = 'type="cylinder" size="0.03 0.08"'
@@ -216,7 +210,7 @@ def test_a_draft_has_what_was_found_and_what_is_to_be_mended(monkeypatch, capsys
     assert proposal.table["joints"]["left"] == JOINTS[:4]
     arm = "<body><joint name='one' axis='0 1 0'/><geom size='0.1'/></body>"
     (tmp_path / "arm.xml").write_text(f"<mujoco><worldbody>{arm}</worldbody></mujoco>")
-    assert command(monkeypatch, tmp_path / "arm.xml") == 2
+    assert call(monkeypatch, "robot", tmp_path / "arm.xml") == 2
     printed, err = capsys.readouterr()
     assert re.search(r"no two legs found, .* by their last joint: one \(1\)", err)
     assert "# To be mended: " in printed
@@ -238,7 +232,7 @@ def test_what_a_hand_written_file_leaves_out_is_filled_in_by_the_rules(
     assert proposal.table == expected
     assert {"joints", "gait.swing", "weights.nominal.force"} <= set(proposal.filled)
     assert not {"gait", "gait.stance", "model"} & set(proposal.filled)
-    assert command(monkeypatch, path) == 0
+    assert call(monkeypatch, "robot", path) == 0
     assert "left out " in capsys.readouterr().out
 
 
@@ -264,7 +258,7 @@ def test_legs_that_a_file_names_are_checked_and_taken(tmp_path):
 def test_the_standard_form_is_read_as_it_is_and_is_the_same_robot(monkeypatch, tmp_path, kind):
     out = tmp_path / "new.toml"
     model = {"line": edited(tmp_path), "point": QUADRUPED, "flat": HUMANOID}[kind]
-    assert command(monkeypatch, model, "--out", out) == 0
+    assert call(monkeypatch, "robot", model, "--out", out) == 0
     description = read_description(out)
     assert build_spec(description).notes == ()
     assert description.standing == description.standing_key
@@ -317,14 +311,14 @@ def test_soles_of_meshes_are_asked_for(monkeypatch, capsys, tmp_path):
     (line,) = [line for line in proposal.wrong if "guessed" in line]
     assert line.startswith("no box, sphere, capsule or cylinder of body 'left_foot' collides")
     assert line.endswith("measure the sole and correct feet.left and feet.right")
-    assert command(monkeypatch, path, "--out", draft) == 2
+    assert call(monkeypatch, "robot", path, "--out", draft) == 2
     err = capsys.readouterr().err
     assert f"the proposal is in {draft}; mend it, then: hector robot {draft}" in err
     assert err.endswith(f"hector: {line}\n")
     assert f"# To be mended: {line}" in draft.read_text()
     assert read_description(draft).model == path
     # whoever leaves the contacts as they are takes them
-    assert command(monkeypatch, draft, "--out", out) == 0
+    assert call(monkeypatch, "robot", draft, "--out", out) == 0
     assert f"walk with it: hector walk --robot {out}" in capsys.readouterr().err
     assert read_description(out).model == tmp_path / "robot-standard.xml"
 
@@ -378,7 +372,7 @@ def test_gains_follow_from_what_hangs_at_a_joint_and_sizes_scale_with_mass_and_h
 
 
 def test_the_command_prints_the_table_and_the_proposal(monkeypatch, capsys):
-    assert command(monkeypatch, MODEL_PATH) == 0
+    assert call(monkeypatch, "robot", MODEL_PATH) == 0
     out = capsys.readouterr().out
     table, text = out.split("\n\n", 1)
     assert table.startswith("robot    hector: 12 kg, trunk 'trunk'")
@@ -392,15 +386,15 @@ def test_the_command_prints_the_table_and_the_proposal(monkeypatch, capsys):
 
 def test_a_proposal_is_written_once_and_beside_its_model(monkeypatch, capsys, tmp_path):
     model, out = edited(tmp_path), tmp_path / "other" / "robot.toml"
-    assert command(monkeypatch, model, "--out", out) == 0
+    assert call(monkeypatch, "robot", model, "--out", out) == 0
     assert out.read_text().startswith("# Proposed by `hector robot ")
     assert read_description(out).model == out.with_name("robot-standard.xml")
-    assert command(monkeypatch, out) == 0
+    assert call(monkeypatch, "robot", out) == 0
     for wrong, text in ((out, "must be a new file"), (tmp_path / "robot.txt", "must end in .toml")):
-        assert command(monkeypatch, model, "--out", wrong) == 2
+        assert call(monkeypatch, "robot", model, "--out", wrong) == 2
         assert text in capsys.readouterr().err
     out.unlink()
-    assert command(monkeypatch, model, "--out", out) == 2
+    assert call(monkeypatch, "robot", model, "--out", out) == 2
     assert "robot-standard.xml, which must be a new file" in capsys.readouterr().err
 
 

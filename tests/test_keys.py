@@ -76,7 +76,6 @@ DEPENDS_ON = {
     "seed of a walk": lambda k: JOB._replace(seed=k),
     "engine": lambda k: MUJOCO_C._replace(walk=lambda *inputs, **options: k).key,
     "seed of a collection": collected,
-    "robot of a collection": lambda k: collected(robot=robot_with(estimate_noise=float(k))),
     "engine of a collection": lambda k: collected(engine=("c", "mjx")[k]),
 }
 

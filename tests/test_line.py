@@ -8,23 +8,12 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
-from pretend import call
+from pretend import refused
 
 from hector_jax.cli import commands
-from hector_jax.cli.arguments import flag_folder
 from hector_jax.cli.flags import COMMANDS, Compare, Evaluate, Export, Tune, View, Walk
 from hector_jax.cli.parse import from_line, resolve_latest
 from hector_jax.core.inputs import InputError
-from hector_jax.robot.model import load_robot
-
-
-def refused(monkeypatch, capsys, *words):
-    """The one line that a command is refused with."""
-    assert call(monkeypatch, *words) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.count("\n") == 1, err
-    return err.strip()
 
 
 def test_flags_are_taken_in_any_order_and_spelling():
@@ -52,11 +41,9 @@ def test_flags_are_taken_in_any_order_and_spelling():
         ("walk --wrold hfs", "walk has no flag '--wrold'; did you mean '--world'?"),
         ("walk --zzz", "walk has no flag '--zzz'; see hector walk --help"),
         ("walk there", "walk does not expect 'there'; see hector walk --help"),
-        ("walk --json yes", "walk does not expect 'yes'; see hector walk --help"),
         ("walk --seed", "Missing value for argument '--seed'. Expected 1 values."),
         ("walk --seed 1 --seed 2", "--seed is given twice"),
         ("evaluate --weights nominal nominal", "--weights names 'nominal' twice"),
-        ("view . --sets with", "Missing value for argument '--sets'. Expected 2 values."),
         ("view", "Missing from hector view: PATH folder of a run"),
         ("walk --seconds long", "Error parsing --seconds: expected a number, got 'long'"),
         ("walk --world moon", "invalid choice 'moon' for argument '--world'. Expected one of ('"),
@@ -145,16 +132,6 @@ def test_latest_is_the_newest_run(monkeypatch, tmp_path):
 
 SLALOM = Path(__file__).parents[1] / "examples" / "slalom.toml"
 STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
-
-
-@pytest.mark.parametrize("name", ["collect", "search"])
-def test_a_given_folder_is_taken_as_it_is_for_another_robot_too(name):
-    robot = load_robot(STRIDER)
-    default = from_line([name, "--robot", str(STRIDER)])
-    given = from_line([name, "--robot", str(STRIDER), "--out", str(default.out)])
-    assert flag_folder(given, "out", robot) == default.out
-    first, *rest = default.out.parts
-    assert flag_folder(default, "out", robot) == Path(first, "strider", *rest)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from hector_jax.core.tree import stack
 from hector_jax.grfm import paper, residual
 from hector_jax.grfm.dataset import ACROSS, ALONG, at_interval, make_dataset, with_mirror
 from hector_jax.grfm.effect import HISTORY, last_command
-from hector_jax.grfm.gated import fit_gated, hats
+from hector_jax.grfm.gated import fit_gated
 from hector_jax.grfm.network import as_effect, effect_of, load_net, save_net
 from hector_jax.grfm.paper import fit_linear, fit_scaling
 from hector_jax.grfm.residual import BOUND, plain_net
@@ -211,12 +211,6 @@ def test_a_leg_pushes_only_while_it_swings(gated, window):
     standing = window._replace(contact=jnp.array([True, True]))
     assert np.any(apply(as_effect(gated), window).legs.force != 0.0)
     assert not np.any(apply(as_effect(gated), standing).legs.force)
-
-
-def test_hats_are_one_at_their_knot_and_sum_to_one():
-    knots = jnp.array([0.0, 0.01, 0.05])
-    np.testing.assert_allclose(hats(knots, knots), np.eye(3))
-    np.testing.assert_allclose(hats(jnp.linspace(-0.01, 0.1, 23), knots).sum(axis=1), 1.0)
 
 
 def test_the_plain_net_returns_every_command_and_has_the_shapes_of_a_trained_one(windows, ensemble):

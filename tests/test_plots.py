@@ -6,7 +6,6 @@ from matplotlib.colors import to_rgb
 from pretend import elsewhere, pretend_history, pretend_walk
 
 from hector_jax.core.trajectory import State
-from hector_jax.grfm.nets import History
 from hector_jax.report import plots
 from hector_jax.report.plots.style import SETS, looks_of
 from hector_jax.tuning.loss import PAPER_LOSS
@@ -80,16 +79,6 @@ def test_the_loss_by_iteration_shows_refused_steps_that_are_no_numbers(tmp_path,
     assert [3, 5] in crosses
     (legend,) = drawn[0].legends
     assert "refused step" in [text.get_text() for text in legend.get_texts()]
-
-
-def test_the_epoch_of_the_least_error_on_the_validation_walks_is_marked(tmp_path, drawn):
-    falling = np.geomspace(300.0, 60.0, 50)
-    held = np.r_[falling[:30] + 5, falling[29] + np.arange(5.0, 25.0)]
-    plots.save_training(tmp_path / "net.png", History(falling, falling / 300, held, falling / 250))
-    force, moment = drawn[0].axes
-    assert lines(force)["least"].tolist() == [[30.0, held[29]]]
-    assert "N$^2$" in force.get_ylabel()
-    assert "(N m)$^2$" in moment.get_ylabel()
 
 
 @pytest.mark.parametrize("ending", ["png", "svg", "pdf"])

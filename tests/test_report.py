@@ -79,12 +79,6 @@ def test_the_table_has_a_row_for_each_set_and_marks_a_comparison_that_falls_make
     assert "…" not in printed(fallen, force_terminal=True, width=80)
 
 
-def test_the_table_goes_without_baselines_that_were_not_walked():
-    whole = pretend_verdict(2)
-    text = printed(whole._replace(scores={"mine.json": whole.scores["with"]}))
-    assert not re.search("against|Change of L", text)
-
-
 def test_walks_are_not_counted_as_plants_and_one_plant_has_no_interval(tmp_path):
     verdict = pretend_verdict(4, {("with", 0)}, scenes=("straight", "c", "s"))
     first, second, *_ = report.legend(verdict)

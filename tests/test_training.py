@@ -78,17 +78,6 @@ def test_the_same_seed_makes_the_same_bytes(parts):
     assert not np.array_equal(*kernels)
 
 
-def test_sixteen_samples_can_be_learned_by_heart(parts):
-    # again and again, as many as there are in `parts`: one program
-    repeated = [20 + np.arange(len(part.walk)) % 16 for part in parts]
-    few, again = (jax.tree.map(lambda x, rows=rows: x[rows], parts[0]) for rows in repeated)
-    config = paper(epochs=30, learning_rate=3e-3, l2=0.0, mirror=False)
-    params, history = train(config, few, again)
-    spread = float(few.label.force.var(axis=0).mean())
-    assert history.valid_force.min() < 1e-3 * spread
-    assert errors(as_effect(params), few).force < 1e-3 * spread
-
-
 def test_no_samples_and_samples_that_are_not_finite_are_refused(parts):
     none = jax.tree.map(lambda x: x[:0], parts[0])
     with pytest.raises(ValueError, match="validation set has no samples"):

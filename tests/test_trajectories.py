@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pretend import instead
+from pretend import call, instead
 
 from hector_jax.cli import arguments
-from hector_jax.cli.main import main
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import (
@@ -40,13 +39,6 @@ def test_the_example_is_a_command_of_six_seconds_that_ends_as_it_began():
     np.testing.assert_array_equal(found.command.velocity[-1], [0.2, 0.1])
     end = reference_at(0.01, found.command, standing_anchor(ROBOT), 600.0)
     assert end.euler[2] == pytest.approx(0.0, abs=1e-9)
-
-
-def test_missing_files_and_unknown_names_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="none.toml: cannot read a trajectory: No such file"):
-        command_of(str(tmp_path / "none.toml"))
-    with pytest.raises(ValueError, match="'strait'; did you mean 'straight'"):
-        command_of("strait")
 
 
 def test_the_limits_are_those_that_the_robot_was_seen_to_have():
@@ -92,8 +84,7 @@ def test_a_walk_lasts_as_long_as_its_file_says_with_a_warning_beyond_the_limits(
         raise InputError("walked")
 
     def told(trajectory):
-        monkeypatch.setattr("sys.argv", ["hector", "walk", "--traj", str(trajectory)])
-        main()
+        call(monkeypatch, "walk", "--traj", trajectory)
         out, err = capsys.readouterr()
         assert out == ""
         return err

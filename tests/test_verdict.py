@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pretend import call, instead, pretend_score, pretend_walk
+from pretend import call, instead, pretend_score, pretend_walk, refused
 
 from hector_jax.cli import verdict as command
 from hector_jax.control.weights import expert, nominal
@@ -200,9 +200,6 @@ def test_wrong_input_is_one_line_before_anything_is_walked(
     file = tmp_path / "sets" / "c.json"
     save_weights(file, nominal())
     words = words.format(file=file, folder=file.parent).split()
-    assert call(monkeypatch, "verdict", "--out", tmp_path / "out", *words) == 2
-    lines = [x for x in capsys.readouterr().err.splitlines() if x.startswith("hector: ")]
-    assert len(lines) == 1
-    assert fault in lines[0]
+    assert fault in refused(monkeypatch, capsys, "verdict", "--out", tmp_path / "out", *words)
     assert walked.jobs == []
     assert not (tmp_path / "out").exists()

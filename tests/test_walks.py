@@ -118,17 +118,6 @@ def test_any_engine_walks_and_is_recorded(robot, in_process, tmp_path):
         walks.read_record(replace(one, engine=MUJOCO_C))
 
 
-def test_the_plain_model_is_not_grounded(robot, pool, in_process):
-    one, _, rows = in_process
-    losses = [
-        walks._model(pool, replace(one, model=model), walks.campaign_space(pool, one), rows[:1])
-        for model in ("grounded", "plain")
-    ]
-    point = rows[1].point
-    assert losses[0].evaluate(rows[0].point)[0] == pytest.approx(1.0)
-    assert losses[0].evaluate(point)[0] != losses[1].evaluate(point)[0]
-
-
 def test_the_record_of_another_tuning_is_refused(robot, in_process):
     one = replace(in_process[0], seed=1)
     with pytest.raises(InputError, match=r"made with seed 0, this command expects 1"):
