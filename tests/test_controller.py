@@ -231,7 +231,7 @@ def test_a_foot_that_lands_twice_within_the_horizon_lands_a_stride_further():
     assert config.touchdowns == 3
     walking = jax.tree.map(jnp.asarray, standing())
     state = walking.state._replace(velocity=jnp.array([0.5, 0.0, 0.0]))
-    horizon, touchdown = jax.jit(
+    horizon, _, touchdown = jax.jit(
         lambda state, feet: plan_horizon(
             config,
             ROBOT,

@@ -196,7 +196,7 @@ def test_a_key_has_the_versions_of_all_packages_that_compute(see):
 @pytest.mark.parametrize(
     ("module", "old", "new", "same"),
     [
-        ("control.footstep", "stance / 2 * state.velocity", "stance / 3 * state.velocity", False),
+        ("control.footstep", "config.ahead * stance", "config.travel * stance", False),
         ("control.footstep", "    points = (", "    # a comment\n    points = (", True),
         ("control.footstep", "Next touchdown of each foot", "Another docstring", True),
         ("core.console", "_QUIET = 15.0", "_QUIET = 16.0", True),

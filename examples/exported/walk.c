@@ -58,7 +58,8 @@ int main(int count, char **words) {
             anchor.tick = 0;
         }
         controller_step(&controller, &estimate, &command, &anchor, &output);
-        if (output.status != CONTROLLER_SOLVED) ++unsolved; /* on a robot: hold, sit down or stop */
+        if (output.status != CONTROLLER_SOLVED && output.status != CONTROLLER_NOT_UNIQUE)
+            ++unsolved; /* on a robot: hold, sit down or stop */
         mju_copy(d->ctrl, output.torque, CONTROLLER_JOINTS); /* on a robot: to its motors */
         mj_step(m, d);
     }

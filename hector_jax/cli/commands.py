@@ -222,7 +222,8 @@ def run_export(args: flags.Export) -> None:
         out = folder / args.template.name.removesuffix(".j2")
         if out.resolve() == args.template.resolve():
             raise InputError(f"--template {out} would be overwritten; name it {out.name}.j2")
-        write_file(out, fill_template(args.template, path).encode())
+        weights = load_weights(path, load_robot(args.robot))
+        write_file(out, fill_template(args.template, weights).encode())
         say(f"{out} has the weights {path}")
         return
     if is_run and args.robot:

@@ -49,7 +49,7 @@ def run_twin(args: Twin) -> None:
     robot = load_robot(args.robot)
     config, trajectory = walk_config(robot), arguments.load_trajectory(args.traj, robot)
     seconds = arguments.walk_seconds(args, trajectory)
-    walk, _ = read_walk(args.log, robot, seconds, config.gait.tick)
+    walk, end = read_walk(args.log, robot, seconds, config.gait.tick)
     weights = arguments.weights_by_name(args.weights, robot)
     parity = compare_plans(config, robot, weights, trajectory.command, walk)
     row, axis = parity.worst
@@ -60,13 +60,16 @@ def run_twin(args: Twin) -> None:
     }
     at_worst |= {"logged": parity.logged[row, axis], "twin": parity.twin[row, axis]}
     result = {
+        "ended": end,
         "plans": parity.plans,
         **{name: _quantiles(parity, i) for i, name in enumerate(COMPONENTS)},
         "worst": at_worst,
+        "by_log": parity.by_log,
         "other_contact": parity.other_contact,
         "unsolved": parity.unsolved,
     }
-    print_result(args.json, result, lambda: print(*_parity_lines(parity, robot), sep="\n"))
+    lines = [*([end] if end else []), *_parity_lines(parity, robot)]
+    print_result(args.json, result, lambda: print(*lines, sep="\n"))
 
 
 def _quantiles(parity: Parity, component: int) -> dict[str, float]:
@@ -87,6 +90,8 @@ def _parity_lines(parity: Parity, robot: Robot) -> Iterator[str]:
         f"most at {parity.time[row]:.3f} s, {side} foot, {COMPONENTS[axis]}: "
         f"{parity.logged[row, axis]:.6g} in the log, {parity.twin[row, axis]:.6g} of the twin"
     )
+    if parity.by_log is not None and parity.by_log < 0.5 * parity.distance.max():
+        yield f"from the reference in the log on, at most {parity.by_log:.2g}: see [twin] reference"
     if parity.other_contact:
         share = 100 * parity.other_contact
         yield f"in {share:.0f} % of the plans the log has other feet on the floor: see [gait]"

@@ -137,7 +137,7 @@ class Plan(NamedTuple):
 
 def contacts_needed(config: WalkConfig, tick: int) -> int:
     """Return the largest number of feet with inputs in a plan: all before the gait starts."""
-    gait, every = config.gait, config.twin.air_moments
+    gait, every = config.gait, config.twin.air_moments or config.twin.contact_at < 0.0
     return len(gait.offsets) if every or tick < gait.first_tick else gait.most_contacts
 
 
@@ -152,15 +152,15 @@ def plan_horizon(
     state: State,
     feet: Feet,
     desired: State | None = None,
-) -> tuple[Horizon, Feet]:
-    """Return the horizon of the MPC and the next touchdown of each foot.
+) -> tuple[Horizon, State, Feet]:
+    """Return the horizon of the MPC, its reference now, and the next touchdown of each foot.
 
     Args:
         config, robot, parameters: the controller.
         command, anchor: the commanded motion.
         tick: current gait tick.
         state: current base state.
-        feet: current foot points; those of feet in the air are not used.
+        feet: current foot points; those of feet in the air are used by a frozen twin only.
         desired: pose at the start of the reference; None: by the rule of the twin.
 
     Source: Eq. 6, 14-16.
@@ -196,7 +196,7 @@ def plan_horizon(
         inputs=jnp.ones_like(contact) if twin.air_moments else None,
         frame=rotation_from_euler(state.euler) if twin.frame == "trunk" else None,
     )
-    return horizon, touchdowns[0]
+    return horizon, current, touchdowns[0]
 
 
 def limit_distance(
@@ -241,7 +241,7 @@ def plan(
         command, anchor: the commanded motion.
         tick: current gait tick.
         state: current base state.
-        feet: current foot points; those of feet in the air are not used.
+        feet: current foot points; those of feet in the air are used by a frozen twin only.
         disturbance: from the previous plan.
         last: wrench of the previous plan, which is kept between plans of several ticks; None: plan.
         desired: pose at the start of the reference of a log; None: by the rule of the twin.
@@ -253,7 +253,7 @@ def plan(
     Source: Eq. 3-6.
     """
     state = config.twin.state(robot, state)
-    horizon, touchdown = plan_horizon(
+    horizon, reference, touchdown = plan_horizon(
         config,
         robot,
         parameters.footstep,
@@ -265,7 +265,6 @@ def plan(
         desired=desired,
     )
     dt, every = config.gait.tick, config.twin.plan_ticks
-    reference = reference_at(dt, command, anchor, tick)
     horizon = limit_distance(horizon, state, reference, parameters.mpc.position_limit)
     disturbance = integrate_error(parameters.mpc.integral, disturbance, state, reference, dt)
     body = config.twin.body(robot)
@@ -300,11 +299,18 @@ def measured_feet(robot: Robot, measurement: Measurement) -> Feet:
     return Feet(position, measurement.state.euler[2] + offset)
 
 
+def standing_wrench(robot: Robot) -> Wrench:
+    """Return the wrench (feet, 3) of the ground on a standing robot, shared by all feet."""
+    feet = len(robot.foot_point)
+    share = robot.mass / feet * jnp.asarray(robot.gravity)
+    force = jnp.broadcast_to(share, (feet, 3))
+    return Wrench(force, jnp.zeros_like(force))
+
+
 def init_memory(robot: Robot, measurement: Measurement) -> Memory:
     """Return the memory of a standing robot."""
     feet = measured_feet(robot, measurement)
-    none = Wrench(jnp.zeros_like(feet.position), jnp.zeros_like(feet.position))
-    return Memory(feet, NO_DISTURBANCE, first_grip(feet.position), none)
+    return Memory(feet, NO_DISTURBANCE, first_grip(feet.position), standing_wrench(robot))
 
 
 def step_plan(

@@ -125,7 +125,9 @@ ALONG_REFERENCE = Linearisation("along_reference", of=_along_reference)
 """At the yaw of the reference, with the feet of each step."""
 
 FROZEN = Linearisation("frozen", of=_frozen)
-"""At the present attitude with the present feet, for all steps."""
+"""At the present attitude with the present feet, for all steps.
+
+A foot in the air is where it is in logs and simulators, at its touchdown in the rollouts."""
 
 Linearisation.known = (ALONG_REFERENCE, FROZEN)
 
@@ -135,7 +137,7 @@ class TwinConfig:
     """How the MPC predicts and how often it plans; the defaults are those of this project."""
 
     reference: ReferenceRule = PATH
-    # [m/s], [rad/s] x, y and yaw whose command is slower are those of the path
+    # [m/s], [rad/s] x, y and yaw, world frame, whose command is slower are those of the path
     at_rest: Annotated[float, NOT_NEGATIVE] = 0.0
     late: Annotated[int, NOT_NEGATIVE] = 0  # steps by which the target of a step is that before it
     linearisation: Linearisation = ALONG_REFERENCE
@@ -158,6 +160,8 @@ class TwinConfig:
             if (got := getattr(self, name)) is not None and len(got) != 3:
                 text = f"TwinConfig.{name} must be 3 numbers"
                 raise InputError(f"{text}, got {short_repr(got)}")
+        if self.com is not None and self.height is None:
+            raise InputError("TwinConfig.com needs height, that of this point in the reference")
 
     def body(self, robot: Robot) -> Robot:
         """Return the robot as the MPC takes it to be."""
@@ -175,7 +179,7 @@ class TwinConfig:
         return state._replace(position=state.position + offset, velocity=velocity)
 
     def target(self, reference: State, path: State, desired: State | None) -> State:
-        """Return the reference at its height, and from the poses on that are not by its rule.
+        """Return the reference at the twin's height, from the path on where it is at rest.
 
         Args:
             reference: by the rule, at the steps (N + 1, 3).

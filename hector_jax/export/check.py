@@ -138,7 +138,8 @@ def compile_controller(source: dict[str, str], folder: Path, *flags: str) -> Pat
     library = folder / "controller.so"
     done = subprocess.run([*words, "-o", library.name], cwd=folder, capture_output=True, text=True)
     if done.returncode:
-        raise Broken(f"the compiler refuses controller.c: {done.stderr.strip().splitlines()[0]}")
+        lines = [*done.stderr.strip().splitlines(), f"exit code {done.returncode}"]
+        raise Broken(f"the compiler refuses controller.c: {lines[0]}")
     return library
 
 

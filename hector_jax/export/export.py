@@ -94,7 +94,7 @@ def controller_of_run(run: Path) -> WalkConfig:
 
 def _require_same(result: Check) -> None:
     """Raise `Broken` if the compiled controller differs from the live one or fails to solve."""
-    if not max(result[:3]) <= TOLERANCE:
+    if not np.max(result[:3]) <= TOLERANCE:
         raise Broken(
             f"the compiled controller differs from the live one by {result.force:.1e} N, "
             f"{result.moment:.1e} N m and {result.torque:.1e} N m at the joints, at most "

@@ -4,20 +4,21 @@ from pathlib import Path
 
 from jinja2 import Environment, StrictUndefined, TemplateError, TemplateSyntaxError
 
+from hector_jax.control.weights import Weights
+from hector_jax.control.weights_file import weights_tree
 from hector_jax.core.inputs import InputError, one_line
-from hector_jax.core.settings import read_json
 
 
-def fill_template(template: Path, weights: Path) -> str:
-    """Return the text of a template of Jinja with the numbers of a weights file.
+def fill_template(template: Path, weights: Weights) -> str:
+    """Return the text of a template of Jinja with the numbers of weights.
 
-    The template names them as the file does, in the order and the units that it needs, as in
+    The template names them as a weights file does, in the order and the units that it needs, as in
     `Kp = {{ Q.euler[0] }}` or `{{ "%.4f" % (1e3 * R.force[0][2]) }}`.
 
     Raises:
-        InputError: a file cannot be read, or a name in the template is not in the weights file.
+        InputError: the template cannot be read, or names what the weights do not have.
     """
-    names = read_json(weights, "a weights file")
+    names = weights_tree(weights)
     made = Environment(undefined=StrictUndefined, keep_trailing_newline=True, autoescape=False)
     try:
         return made.from_string(template.read_text()).render(names)

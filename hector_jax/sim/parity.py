@@ -32,6 +32,7 @@ class Parity(NamedTuple):
     logged: Float[np.ndarray, "rows 6"]  # wrenches [N, N m]
     twin: Float[np.ndarray, "rows 6"]
     plans: int
+    by_log: float | None  # largest difference if plans start at the reference in the log, if any
     other_contact: float  # share of the plans in which other feet stand
     unsolved: int  # plans of the twin
 
@@ -56,8 +57,8 @@ def compare_plans(
         config, robot: of the twin.
         weights, command: with which the controller walked.
         walk: as `read_walk` returns it. A plan is at t = 0 and each `plan_interval` after it; the
-            first is left out, because the log has no joints before it. If it has a reference, that
-            of each plan starts there.
+            first is left out, because the log has no joints before it. Integral action and slips
+            before t = 0 are not in the plans.
 
     Raises:
         InputError: the walk is shorter than two plans.
@@ -67,21 +68,24 @@ def compare_plans(
     rows = np.arange(every, int(np.sum(~walk.fallen)), every)
     if not len(rows):
         raise InputError(f"a walk of at least two plans of {config.plan_interval:g} s is needed")
-    own = walk.reference if walk.reference.position.any() else None  # the log has one
-    before = walk.state, walk.joints, own
-    before = jax.tree.map(lambda x: x[rows - 1], before)
-    planned = _plans(config, robot, weights, command, (walk.initial, *before, rows // per_tick))
-    wrench, contact, residual = jax.tree.map(np.asarray, planned)
-    plan, foot = np.nonzero(contact)
-    logged, twin = (
-        np.concatenate(x, axis=-1)[plan, foot]
-        for x in (jax.tree.map(lambda x: x[rows], walk.command), wrench)
+    state, joints, own = jax.tree.map(
+        lambda x: x[rows - 1], (walk.state, walk.joints, walk.reference)
     )
+    begins = state, joints, rows // per_tick
+    solve = partial(_plans, config, robot, weights, command)
+    wrench, contact, residual = jax.tree.map(np.asarray, solve((walk.initial, None, *begins)))
+    plan, foot = np.nonzero(contact)
+    command_at = jax.tree.map(lambda x: x[rows], walk.command)
+    logged, twin = (np.concatenate(x, axis=-1)[plan, foot] for x in (command_at, wrench))
+    by_log = None
+    if own.position.any():
+        from_own = np.concatenate(solve((walk.initial, own, *begins))[0], axis=-1)[plan, foot]
+        by_log = float(np.abs(logged - from_own).max())
     stands = walk.contact[rows]
     other = np.mean(np.any(stands != contact, axis=1)) if walk.contact.any() else 0.0
     unsolved = int(np.sum(~(residual <= SOLVED)))
     time = rows[plan] * float(walk.period)
-    return Parity(time, foot, logged, twin, len(rows), float(other), unsolved)
+    return Parity(time, foot, logged, twin, len(rows), by_log, float(other), unsolved=unsolved)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -89,11 +93,11 @@ def _plans(
     config: WalkConfig, robot: Robot, weights: Weights, command: Command, walk: tuple
 ) -> tuple[Wrench, Array, Array]:
     """Return wrenches, stance feet and residuals of the plans."""
-    initial, *plans = walk
+    initial, own, *plans = walk
     anchor, parameters = anchor_at(robot, initial, 0), config.parameters(weights)
 
     def one(disturbance: Disturbance, inputs: tuple) -> tuple[Disturbance, tuple]:
-        state, joints, desired, tick = inputs
+        desired, state, joints, tick = inputs
         feet = measured_feet(robot, Measurement(state, joints, jnp.zeros_like(joints)))
         planned, disturbance = plan(
             config,
@@ -110,5 +114,5 @@ def _plans(
         )
         return disturbance, (planned.wrench, planned.contact, planned.residual)
 
-    _, planned = jax.lax.scan(one, NO_DISTURBANCE, tuple(plans))
+    _, planned = jax.lax.scan(one, NO_DISTURBANCE, (own, *plans))
     return planned

@@ -89,6 +89,8 @@ def collect(
     with locked(folder):
         if (path := Path(folder) / _CARD).exists():
             check_settings(path, _read_card(folder)["settings"], card["settings"])
+        elif any(Path(folder).glob("walk-*.npz")):
+            raise InputError(f"{folder}: has walks but no {_CARD} that says of what; remove it")
         else:
             write_json(path, card)
         like = walks_like(robot)

@@ -15,7 +15,14 @@ from jaxtyping import Bool, Int
 
 from hector_jax import qp
 from hector_jax.control import gait
-from hector_jax.control.controller import Plan, WalkConfig, contacts_needed, plan, walk_config
+from hector_jax.control.controller import (
+    Plan,
+    WalkConfig,
+    contacts_needed,
+    plan,
+    standing_wrench,
+    walk_config,
+)
 from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
 from hector_jax.control.footstep import Feet, feet_where
 from hector_jax.control.reference import Anchor, Command, anchor_at, reference_at
@@ -120,8 +127,7 @@ def init_carry(scenario: Scenario) -> Carry:
     robot, anchor, zero = scenario.robot, scenario.anchor, jnp.zeros(3)
     trunk = anchor.position - robot.com_offset
     local = foot_poses(robot, jnp.asarray(robot.standing_joints)).position
-    share = robot.mass / len(local) * jnp.asarray(robot.gravity)
-    standing = Wrench(jnp.broadcast_to(share, local.shape), jnp.zeros_like(local))
+    standing = standing_wrench(robot)
     state = State(zero, anchor.position, zero, zero)
     feet = Feet(trunk + local, jnp.zeros(len(local)))
     commands = command_history(standing)

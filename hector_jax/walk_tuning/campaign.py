@@ -78,7 +78,8 @@ def walker_hash(robot: Robot) -> str:
     """
     d = robot.description
     feet = tuple(map(tuple, d.feet))
-    parts = d.standing, d.joints, d.linkage, d.weld, d.armature, feet, d.control
+    control = [section for section in d.control if section[0] != "twin"]
+    parts = d.standing, d.joints, d.linkage, d.weld, d.armature, feet, tuple(control)
     return hashlib.sha256(repr(parts).encode() + d.model.read_bytes()).hexdigest()[:16]
 
 
