@@ -52,7 +52,7 @@ PACKAGES = {  # in this order: title and purpose of each page of the reference
     "grfm": ("Ground reaction net", "phi: the map from command to effect, its data and training."),
     "tuning": ("Tuning", "Rollout, loss and Gauss-Newton steps, for one problem or for many."),
     "search": ("Search", "Tuning by walks on a simulator, without derivatives."),
-    "store": ("Store", "What is computed once and kept: nets, tunings, the folder of a run."),
+    "store": ("Store", "What is computed once and kept: walks, nets, tunings, runs."),
     "verdict": ("Verdict", "Walks of weight sets, scores and their statistics."),
     "importing": ("Importing", "The settings of robots that others publish, by rules."),
     "walk_tuning": ("Tuning on walks", "Proposals, logs of walks and their record."),
@@ -62,12 +62,13 @@ PACKAGES = {  # in this order: title and purpose of each page of the reference
 PUBLIC = {  # of packages without `__all__`, in whichever of their modules they are defined
     "core": "State Wrench Load Trajectory InputError setup_jax",
     "robot": "Robot load_robot Description foot_poses foot_jacobians inverse_legs linearise",
-    "sim": "Imperfections ideal hfs hfs_varied standin Job walk Engine choose_engine",
-    "grfm": "Window Effect Phi as_effect load_net save_net load_walks TrainConfig train",
+    "sim": """Imperfections ideal hfs hfs_varied standin Job walk Engine choose_engine walker_of
+        walker_engine compare_plans""",
+    "grfm": "Window Effect Phi as_effect load_net save_net TrainConfig train",
     "tuning": """RolloutConfig rollout LossTerm losses with_alphas TuneConfig Evaluation Tuning
         tune descend""",
     "search": "SearchConfig search",
-    "store": "load_run",
+    "store": "load_run load_walks",
     "verdict": "Score score Verdict make_verdict",
     "importing": "propose_robot standard_form",
     "walk_tuning": "Campaign tune_on_walks",

@@ -140,7 +140,7 @@ def test_a_search_leaves_weights_with_a_card_and_walks_nothing_twice(monkeypatch
     assert call(monkeypatch, *flags, *folders) == 0
     assert capsys.readouterr().out == shown
     assert kept == {path: path.read_bytes() for path in tmp_path.rglob("*.json*")}
-    assert "another search" in refused(monkeypatch, capsys, *flags, *folders, "--seed", "1")
+    assert "choose another folder" in refused(monkeypatch, capsys, *flags, *folders, "--seed", "1")
 
 
 @pytest.mark.slow

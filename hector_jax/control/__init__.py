@@ -1,8 +1,9 @@
 """The walking controller in pure JAX: from command and state to wrench and joint torques.
 
 `reference` integrates the command, `gait` schedules the contacts, `footstep` places the feet, `mpc`
-plans the wrench under the `contact` constraints, `legs` converts it into torques, and `controller`
-calls them in turn. `parameters` holds their numbers in one tree and lists which can be tuned.
+plans the wrench under the `contact` constraints, or as `twin` says of another controller, `legs`
+converts it into torques, and `controller` calls them in turn. `parameters` holds their numbers in
+one tree and lists which can be tuned.
 """
 
 from hector_jax.control.contact import (
