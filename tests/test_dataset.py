@@ -174,6 +174,9 @@ def test_a_collection_of_something_else_is_not_overwritten(tmp_path):
     assert (tmp_path / "walk-00000.npz").read_bytes() == before
     with pytest.raises(ValueError, match="walk-00000.npz: made for robot"):
         load_walks(tmp_path, ROBOT._replace(mass=np.asarray(13.0)))
+    (tmp_path / "card.json").unlink()  # nothing tells whose walks these are
+    with pytest.raises(ValueError, match="has walks but no card.json"):
+        collect(tmp_path, draw_jobs(0, 2), walker([]), robot=ROBOT)
 
 
 def test_the_legs_get_what_the_wrench_does_not_explain(three, data):

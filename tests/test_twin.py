@@ -136,6 +136,16 @@ def test_the_body_of_a_twin_is_planned_with():
     assert heavy > 1.2 * own
     with pytest.raises(InputError, match="TwinConfig.inertia must be 3 numbers"):
         TwinConfig(inertia=(1.0,))
+    with pytest.raises(InputError, match="TwinConfig.com needs height"):
+        TwinConfig(com=(0.0, 0.0, 0.0))
+
+
+def test_a_limit_of_the_position_error_is_one_from_the_twins_own_reference():
+    far = twin(reference=FROM_ROBOT)  # the path is 2 m away
+    free, limited = (
+        planned(replace(far, mpc=MpcConfig(position_limit=limit))).wrench for limit in (None, 0.1)
+    )
+    np.testing.assert_allclose(limited.force, free.force, atol=1e-6)
 
 
 def test_friction_as_a_box_and_a_limited_twist_hold_along_the_foot():
@@ -171,20 +181,24 @@ def test_the_plans_of_the_example_are_those_of_its_twin(walked, monkeypatch, cap
     found = json.loads(capsys.readouterr().out)
     assert found["plans"] == 149
     assert found["unsolved"] == found["other_contact"] == 0
-    assert max(found[name]["worst"] for name in ("F_x", "F_y", "F_z", "M_x", "M_y", "M_z")) < 1e-6
+    assert max(of["worst"] for of in found["differences"].values()) < 1e-6
 
 
 def test_a_twin_of_another_kind_is_told_where_it_differs(walked, tmp_path, monkeypatch, capsys):
     path, line = walked
     (tmp_path / "hector.xml").write_bytes((OWN / "hector.xml").read_bytes())
     text = (OWN / "twin.toml").read_text().replace("cycles = 1", "cycles = 2")
-    text = text.replace("stance = 40\nswing = 40", "stance = 44\nswing = 36")
-    (tmp_path / "other.toml").write_text(text.replace("friction = 0.5", "friction = 0.4"))
-    assert call(monkeypatch, *line, tmp_path / "other.toml") == 0
-    text = capsys.readouterr().out
-    assert "149 plans" in text
-    assert "% of the plans the log has other feet on the floor: see [gait]" in text
-    assert " foot, F_" in text
+    gait = text.replace("stance = 40\nswing = 40", "stance = 44\nswing = 36")
+    for changed, told in (
+        (gait, "% of the plans the log has other feet on the floor: see [gait]"),
+        (text.replace('"from_robot"', '"path"'), "from the reference in the log on, at most "),
+    ):
+        (tmp_path / "other.toml").write_text(changed)
+        assert call(monkeypatch, *line, tmp_path / "other.toml") == 0
+        lines = capsys.readouterr().out
+        assert "149 plans" in lines
+        assert " foot, F_" in lines
+        assert told in lines
 
 
 def test_a_twin_file_is_read_as_a_robots():

@@ -363,7 +363,8 @@ class Export(Printed):
     out: Path | None = None  # folder; by default `export` in the run or beside the weights file
     traj: Annotated[str | None, PathKind.TRAJECTORY] = None  # of the check; by default the run's
     seconds: Seconds = 1.0  # length of that walk after the start-up [s]
-    robot: RobotFile = None  # TOML file of the robot of a weights file; HECTOR by default
+    # TOML file of the robot of a weights file, and with --template of any; HECTOR by default
+    robot: RobotFile = None
     # write no controller, but fill this file of numbers of another one: {{ Q.euler[0] }}, ..
     template: Annotated[Path | None, PathKind.FILE] = None
 

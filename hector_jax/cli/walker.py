@@ -1,9 +1,10 @@
 """A controller of the user: what the logs of its walks show, its twin, a tuning on its walks."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -52,51 +53,52 @@ def run_twin(args: Twin) -> None:
     walk, end = read_walk(args.log, robot, seconds, config.gait.tick)
     weights = arguments.weights_by_name(args.weights, robot)
     parity = compare_plans(config, robot, weights, trajectory.command, walk)
+    result = _parity_result(parity) | {"ended": end}
+    lines = [*([end] if end else []), *_parity_lines(result, robot)]
+    print_result(args.json, result, lambda: print(*lines, sep="\n"))
+
+
+def _parity_result(parity: Parity) -> dict[str, Any]:
+    """Return the differences of plans as JSON values."""
+    shares = {"median": 0.5, "99 %": 0.99, "worst": 1.0}
     row, axis = parity.worst
-    at_worst = {
-        "at": parity.time[row],
-        "foot": int(parity.foot[row]),
-        "component": COMPONENTS[axis],
-    }
-    at_worst |= {"logged": parity.logged[row, axis], "twin": parity.twin[row, axis]}
-    result = {
-        "ended": end,
+    return {
         "plans": parity.plans,
-        **{name: _quantiles(parity, i) for i, name in enumerate(COMPONENTS)},
-        "worst": at_worst,
+        "differences": {
+            component: {name: float(np.quantile(x, share)) for name, share in shares.items()}
+            for component, x in zip(COMPONENTS, parity.distance.T, strict=True)
+        },
+        "worst": {
+            "at": float(parity.time[row]),
+            "foot": int(parity.foot[row]),
+            "component": COMPONENTS[axis],
+            "logged": float(parity.logged[row, axis]),
+            "twin": float(parity.twin[row, axis]),
+        },
         "by_log": parity.by_log,
         "other_contact": parity.other_contact,
         "unsolved": parity.unsolved,
     }
-    lines = [*([end] if end else []), *_parity_lines(parity, robot)]
-    print_result(args.json, result, lambda: print(*lines, sep="\n"))
 
 
-def _quantiles(parity: Parity, component: int) -> dict[str, float]:
-    distance = parity.distance[:, component]
-    names, shares = ("median", "99 %", "worst"), (0.5, 0.99, 1.0)
-    return {n: float(np.quantile(distance, q)) for n, q in zip(names, shares, strict=True)}
-
-
-def _parity_lines(parity: Parity, robot: Robot) -> Iterator[str]:
-    """Return the lines that `hector twin` prints."""
-    yield f"{plural(parity.plans, 'plan')}; differences in N and N m, world frame"
-    yield f"{'':5}{'median':>10}{'99 %':>10}{'worst':>10}"
-    for i, name in enumerate(COMPONENTS):
-        yield f"{name:5}" + "".join(f"{x:10.2g}" for x in _quantiles(parity, i).values())
-    row, axis = parity.worst
-    side = FEET[len(robot.foot_point)][parity.foot[row]].replace("_", " ")
-    yield (
-        f"most at {parity.time[row]:.3f} s, {side} foot, {COMPONENTS[axis]}: "
-        f"{parity.logged[row, axis]:.6g} in the log, {parity.twin[row, axis]:.6g} of the twin"
-    )
-    if parity.by_log is not None and parity.by_log < 0.5 * parity.distance.max():
-        yield f"from the reference in the log on, at most {parity.by_log:.2g}: see [twin] reference"
-    if parity.other_contact:
-        share = 100 * parity.other_contact
+def _parity_lines(result: Mapping[str, Any], robot: Robot) -> Iterator[str]:
+    """Return the lines that `hector twin` prints of its result."""
+    yield f"{plural(result['plans'], 'plan')}; differences in N and N m, world frame"
+    yield f"{'':5}" + "".join(f"{name:>10}" for name in result["differences"]["F_x"])
+    for name, row in result["differences"].items():
+        yield f"{name:5}" + "".join(f"{x:10.2g}" for x in row.values())
+    most = result["worst"]
+    side = FEET[len(robot.foot_point)][most["foot"]].replace("_", " ")
+    at = f"most at {most['at']:.3f} s, {side} foot, {most['component']}"
+    yield f"{at}: {most['logged']:.6g} in the log, {most['twin']:.6g} of the twin"
+    by_log, largest = result["by_log"], max(x["worst"] for x in result["differences"].values())
+    if by_log is not None and by_log < 0.5 * largest:
+        yield f"from the reference in the log on, at most {by_log:.2g}: see [twin] reference"
+    if result["other_contact"]:
+        share = 100 * result["other_contact"]
         yield f"in {share:.0f} % of the plans the log has other feet on the floor: see [gait]"
-    if parity.unsolved:
-        yield f"{plural(parity.unsolved, 'plan')} of the twin not solved"
+    if result["unsolved"]:
+        yield f"{plural(result['unsolved'], 'plan')} of the twin not solved"
 
 
 def tune_walker(folder: Path, args: Tune) -> None:

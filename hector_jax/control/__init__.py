@@ -41,6 +41,7 @@ from hector_jax.control.reference import (
     standing_anchor,
 )
 from hector_jax.control.trajectories import NamedCommand, command_of
+from hector_jax.control.twin import Linearisation, ReferenceRule, TwinConfig
 from hector_jax.control.weights import Weights, expert, nominal
 
 # fmt: off
@@ -49,6 +50,7 @@ __all__ = [
     "ContactModel", "Horizon", "InputConstraint", "InputCost", "Measurement", "Memory",
     "MpcConfig", "MpcProblem", "NamedCommand", "Parameters", "Plan", "Rows", "Squares",
     "StateConstraint", "StateCost", "Step", "Tunable", "WalkConfig", "Weights", "actuate",
-    "build_qp", "command_of", "expert", "init_memory", "named_command", "nominal", "plan",
+    "Linearisation", "ReferenceRule", "TwinConfig", "build_qp", "command_of", "expert",
+    "init_memory", "named_command", "nominal", "plan",
     "reference_at", "solve_mpc", "standing_anchor", "step_plan", "walk_config",
 ]
