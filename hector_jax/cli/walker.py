@@ -92,7 +92,7 @@ def _parity_lines(result: Mapping[str, Any], robot: Robot) -> Iterator[str]:
     at = f"most at {most['at']:.3f} s, {side} foot, {most['component']}"
     yield f"{at}: {most['logged']:.6g} in the log, {most['twin']:.6g} of the twin"
     by_log, largest = result["by_log"], max(x["worst"] for x in result["differences"].values())
-    if by_log is not None and by_log < 0.5 * largest:
+    if by_log is not None and by_log < 0.9 * largest:
         yield f"from the reference in the log on, at most {by_log:.2g}: see [twin] reference"
     if result["other_contact"]:
         share = 100 * result["other_contact"]
