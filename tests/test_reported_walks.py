@@ -45,7 +45,7 @@ def proposed(space, history, *_, **__):
 def folder(monkeypatch, tmp_path):
     """A folder for reports of three trajectories, in which nothing is computed for a proposal."""
     pool = HandsOver()
-    monkeypatch.setattr(propose, "workers", lambda processes: nullcontext(pool))
+    monkeypatch.setattr(propose, "workers", lambda *_: nullcontext(pool))
     instead(monkeypatch, walks.few_walks, "propose", proposed)
     instead(monkeypatch, walks.few_walks, "needs_model", lambda *_: False)
     instead(monkeypatch, walks.few_walks, "incumbent", lambda _, h: walks.few_walks.best_walk(h))

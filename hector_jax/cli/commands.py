@@ -67,7 +67,7 @@ def run_collect(args: flags.Collect) -> None:
     config = nets.CollectConfig(args.walks, args.seconds, args.seed, args.engine)
     robot = load_robot(args.robot)
     out = arguments.flag_folder(args, "out", robot)
-    with workers(args.processes) as pool:
+    with workers(args.processes, args.cluster) as pool:
         nets.collect_walks(pool, config, robot, out)
     say(f"the walks are in {out}")
 
@@ -98,7 +98,7 @@ def run_search(args: flags.Search) -> None:
     out = arguments.flag_folder(args, "out", robot)
     make_folder(out)
     shared: dict[str, Any] = {"commands": commands, "engine": engine}
-    with workers(args.processes) as pool:
+    with workers(args.processes, args.cluster) as pool:
         setup = Setup(pool, tuning, robot)
         results = searches.search_all(setup, config, start, folder=args.record or out, **shared)
         say("walking with the start, expert and best weights")

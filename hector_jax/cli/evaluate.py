@@ -59,7 +59,7 @@ def run_evaluate(args: Evaluate) -> None:
     sets = {text: arguments.weights_by_name(text, robot) for text in args.weights}
     plants = arguments.plants(args.world, seeds, (plant or robot).description)
     config, engine = tunings.tune_config(robot), arguments.engine_of(args)
-    with workers(args.processes) as pool:
+    with workers(args.processes, args.cluster) as pool:
         title = f"evaluating on {plural(count, 'plant')} of {args.world}"
         walks = judging.judge(
             Setup(pool, config, robot),
@@ -175,7 +175,7 @@ def run_grfm(args: Grfm) -> None:
     """Report the prediction errors of each net, with pictures."""
     robot, config = load_robot(), TuneConfig()
     make_folder(args.out)
-    with workers(args.processes) as pool:
+    with workers(args.processes, args.cluster) as pool:
         net = nets.load_or_train(pool, robot, args.data)
         paper = nets.load_or_train(pool, robot, args.data, "paper")
         with say_if_slow("reading the walks that no training saw"):

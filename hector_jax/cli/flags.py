@@ -101,6 +101,8 @@ class Parallel(Flags):
     """A command that computes in several processes."""
 
     processes: Processes = 2  # worker processes, one core each
+    # HOST:PORT of a scheduler of dask.distributed, whose workers compute instead
+    cluster: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

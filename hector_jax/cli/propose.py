@@ -29,11 +29,11 @@ def run_propose(args: Propose) -> None:
     """Propose the next weights to walk with, the same ones until their walk is reported."""
     path = args.folder / CONFIG
     if path.exists():
-        call_flags = ("folder", "json", "processes")
+        call_flags = ("cluster", "folder", "json", "processes")
         args = run_folder.merge_flags(args.folder, from_file(Propose, path), args, call_flags)
     campaign = _campaign(args)
     make_folder(args.folder)
-    with locked(args.folder), workers(args.processes) as pool:
+    with locked(args.folder), workers(args.processes, args.cluster) as pool:
         rows, space = (
             reported_walks.read_reports(pool, campaign),
             walks.campaign_space(pool, campaign),
@@ -66,7 +66,7 @@ def run_report(args: Report) -> None:
         return
     texts = list(map(str, args.logs))
     files = _files(texts, list(campaign.commands))
-    with locked(args.folder), workers(args.processes) as pool:
+    with locked(args.folder), workers(args.processes, args.cluster) as pool:
         before, proposal = walks.read_record(campaign)
         number = len(before)
         if proposal is None:

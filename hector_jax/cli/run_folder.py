@@ -34,7 +34,7 @@ _CODE = (*COLLECTION_CODE, "grfm.training", "sim.standin", "verdict.choice", "wa
 # flags of a call, not of the run that it begins or resumes
 _CALL_FLAGS = ("config", "each", "out", "resume", "runs")
 # flags that may change when a run is resumed
-_FREE_FLAGS = ("data", "json", "processes", "verdict", "video")
+_FREE_FLAGS = ("cluster", "data", "json", "processes", "verdict", "video")
 # flags that say nothing to a program of the user
 _OF_OUR_CONTROLLER = "alpha data iterations net safe smooth variant verdict".split()
 

@@ -144,7 +144,7 @@ def _with_aligned_loss(run: _Run, norms: Mapping[str, float]) -> _Run:
 def _tune_in(folder: Path, args: Tune) -> None:
     """Execute a run, reusing the results already in its folder."""
     start_time, made_with = time.monotonic(), environment()
-    with workers(args.processes) as pool:
+    with workers(args.processes, args.cluster) as pool:
         run = _begin(pool, folder, args)
         robot, first = run.setup.robot, run.trajectories[0]
         given = nets.load_trained(args.net, robot, args.variant)[0] if args.net else None

@@ -63,7 +63,7 @@ def run_verdict(args: Verdict) -> None:
     say(_plan_text(plan))
     make_folder(args.out)
     made_with, config = environment(), tunings.tune_config(plan.robot)
-    with workers(args.processes) as pool:
+    with workers(args.processes, args.cluster) as pool:
         setup = Setup(pool, config, plan.robot)
         cells = walk_cells(setup, plan, args.out / "scores")
     result = report.write_verdict_report(

@@ -121,7 +121,7 @@ def tune_walker(folder: Path, args: Tune) -> None:
         engine=arguments.engine_of(args),
     )
     _check_first(args, campaign, seconds)
-    with workers(args.processes) as pool:
+    with workers(args.processes, args.cluster) as pool:
         rows = tune_on_walks(pool, campaign, args.walks)
         weights, number = answer(campaign, campaign_space(pool, campaign), rows)
         sets, commands = {"set 0": campaign.start, f"set {number}": weights}, campaign.commands

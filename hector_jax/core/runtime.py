@@ -7,18 +7,17 @@ processes) call `setup_jax` once, before the first array.
 import gc
 import os
 import signal
+import socket
 import tempfile
 import threading
 import warnings
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from importlib import import_module
 from multiprocessing import active_children, parent_process
 from multiprocessing.context import SpawnContext, SpawnProcess
-from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, cast
 
 from hector_jax.core.inputs import InputError, check_utf8, one_line, outside_packages
 from hector_jax.core.numerics import pin_options
@@ -106,28 +105,42 @@ class _Spawn(SpawnContext):
 
 
 def _leave_with_parent() -> None:
-    """End this process when its parent ends for any reason.
+    """End this process when the one that started it ends for any reason.
 
     Without this, workers outlive a killed parent: each keeps the queue open on which it waits.
     """
+    if (parent := parent_process()) is None:
+        return
 
     def watch() -> None:
-        cast(BaseProcess, parent_process()).join()
+        parent.join()
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
 
 
-def start_worker(cores: Any) -> None:
+def _claim(core: int) -> bool:
+    """Whether no other worker process of this machine has the core; now this one has it."""
+    name = socket.socket(socket.AF_UNIX)
+    try:
+        name.bind(f"\0hector_jax core {core}")  # no file: the name is free when the process ends
+    except OSError:
+        return False
+    name.detach()
+    return True
+
+
+def start_worker(bind: bool) -> None:
     """Set up a worker process like its parent, which alone handles interrupts and accelerators.
 
-    Several workers are pinned to one core each, the next of the queue `cores`: otherwise their XLA
-    threads would wait for each other, which takes several times as long.
+    Args:
+        bind: bind the process to a core, a free one if there is one. Otherwise the XLA threads of
+            several workers would wait for each other, which takes several times as long.
     """
     _leave_with_parent()
-    core = cores.get()
-    if core is not None:
-        os.sched_setaffinity(0, {core})
+    if bind and hasattr(os, "sched_setaffinity"):
+        cores = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {next(filter(_claim, cores), cores[os.getpid() % len(cores)])})
     # MuJoCo's about a robot's file, which the parent has read too
     warnings.filterwarnings("ignore", category=UserWarning, module="hector_jax")
     import jax
@@ -136,27 +149,26 @@ def start_worker(cores: Any) -> None:
     setup_jax()
 
 
-def _cores(processes: int) -> list[int | None]:
-    """Return a core for each of several processes; None for a single process or without pinning."""
-    if processes < 2 or not hasattr(os, "sched_getaffinity"):
-        return [None] * processes
-    cores = sorted(os.sched_getaffinity(0))
-    first = os.getpid()  # programs that run side by side start at different cores
-    return [cores[(first + i) % len(cores)] for i in range(processes)]
-
-
 @contextmanager
-def workers(processes: int) -> Iterator[ProcessPoolExecutor]:
+def workers(processes: int, cluster: str | None = None) -> Iterator[Executor]:
     """Start worker processes, each set up by `start_worker`; on an error they are killed.
 
     The caller's script has to be importable (`if __name__ == "__main__"`), because the processes
     are spawned.
+
+    Args:
+        processes: their number.
+        cluster: address of a scheduler, whose workers are used instead (`core.cluster`).
     """
+    if cluster is not None:
+        from hector_jax.core.cluster import cluster_workers  # which starts with JAX
+
+        with cluster_workers(cluster) as pool:
+            yield pool
+        return
     spawn, others = _Spawn(), active_children()
-    cores = spawn.SimpleQueue()
-    for core in _cores(processes):
-        cores.put(core)
-    with ProcessPoolExecutor(processes, spawn, initializer=start_worker, initargs=(cores,)) as pool:
+    start = {"initializer": start_worker, "initargs": (processes > 1,)}
+    with ProcessPoolExecutor(processes, spawn, **start) as pool:
         try:
             yield pool
         except BaseException:
