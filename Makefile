@@ -29,7 +29,7 @@ $(STAMP): requirements.lock pyproject.toml
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check --no-deps --editable .
 	@touch $@
 
-engines: $(STAMP) ## install the other physics engines, Drake and Pinocchio
+engines: $(STAMP) ## install the other engines, Drake and Pinocchio, and dask for --cluster
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -r requirements-engines.lock
 
 tune: $(STAMP) ## tune and evaluate: make tune TRAJ=straight|c|s|all, TRAJ="c s", ROBOT=robot.toml
@@ -57,7 +57,7 @@ test-all: $(STAMP) ## the fast and the slow tests, with the shapes in signatures
 	@$(BIN)/pytest -q -n 2 --dist loadfile --jaxtyping-packages=hector_jax,beartype.beartype \
 		-m "slow or not slow"
 
-bench: $(STAMP) ## benchmarks on this machine; peers come with pip install -e ".[bench]"
+bench: $(STAMP) ## benchmarks on this machine, as JSON; peers come with pip install -e ".[bench]"
 	@$(BIN)/python -m benchmarks
 
 check: $(STAMP) ## format, lint and types
@@ -75,4 +75,4 @@ docs: $(STAMP) ## the site, into docs/_build; a warning is an error
 lock: $(STAMP) ## resolve pyproject.toml into requirements.lock and requirements-engines.lock
 	@$(BIN)/python -m pip install --quiet uv
 	@$(LOCK) --extra dev -o requirements.lock
-	@$(LOCK) --extra drake --extra pinocchio -c requirements.lock -o requirements-engines.lock
+	@$(LOCK) --extra cluster --extra drake --extra pinocchio -c requirements.lock -o requirements-engines.lock

@@ -1,4 +1,6 @@
-"""Run the sections, print one table, and write it as JSON to runs/bench/<time>.json.
+"""Run the sections, print their tables, and write them as JSON to runs/bench/<time>.json.
+
+`python -m benchmarks.table` takes such a file for docs/performance.md.
 
 Times and ratios are compared with the last run in that folder on the same kind of machine.
 
@@ -11,6 +13,7 @@ import argparse
 import json
 import os
 import platform
+import re
 import sys
 import time
 from collections.abc import Mapping
@@ -18,6 +21,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from benchmarks.measuring import Check, Report, child, compare, last_run
+from benchmarks.table import lines_of
 from hector_jax.core.console import say
 
 SECTIONS = ("qp_layer", "closed_loop", "realtime", "exported", "collection", "batch", "throughput")
@@ -49,6 +53,13 @@ def _print_report(report: Report, before: Mapping[str, float]) -> None:
         print(f"  ({note})")
 
 
+def _processor() -> str:
+    """Return the name of the processor, where Linux tells it, or its architecture."""
+    path = Path("/proc/cpuinfo")
+    names = re.findall(r"model name\s*: (.+)", path.read_text() if path.exists() else "")
+    return names[0] if names else platform.machine()
+
+
 def main(arguments: list[str]) -> int:
     """Run sections by name; a section that cannot run is told and skipped. 1 if one failed."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
@@ -67,7 +78,8 @@ def main(arguments: list[str]) -> int:
 
     machine = {
         "time": time.strftime("%Y-%m-%dT%H:%M:%S"),
-        "platform": platform.platform(),
+        "platform": f"{platform.system()}, {platform.machine()}",
+        "processor": _processor(),
         "cores": os.cpu_count(),
         "device": device["kind"],
         "quick": chosen.quick,
@@ -91,7 +103,8 @@ def main(arguments: list[str]) -> int:
         sys.stdout.flush()
     chosen.out.mkdir(parents=True, exist_ok=True)
     path = chosen.out / f"{machine['time'].replace(':', '-')}.json"
-    path.write_text(json.dumps({"machine": machine, "sections": reports}, indent=1))
+    run = {"machine": machine, "sections": reports}
+    path.write_text(json.dumps(run | {"table": lines_of(run)}, indent=1))
     say(f"written to {path}")
     return int(failed)
 

@@ -1,12 +1,13 @@
 """The scripts that guard the tests and the numbers: planted faults and golden results."""
 
 import ast
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks import golden, mutation
+from benchmarks import golden, mutation, table
 
 ROOT = Path(__file__).parents[1]
 
@@ -28,3 +29,11 @@ def test_the_difference_of_two_results_is_beside_the_largest_number():
     assert golden.difference(missing, missing) == 0.0
     for other in (missing, one[:1]):
         assert golden.difference(one, other) == np.inf
+
+
+def test_the_page_of_performance_has_the_table_of_its_runs():
+    page = table.PAGE.read_text()
+    assert table.with_table(page) == page
+    for path in table.RUNS.iterdir():
+        run = json.loads(path.read_text())
+        assert run["table"] == table.lines_of(run) != []

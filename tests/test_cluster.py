@@ -6,7 +6,6 @@ import re
 import signal
 import threading
 import time
-from pathlib import Path
 
 import jax.numpy as jnp
 import pytest

@@ -446,7 +446,7 @@ def run():
 
 
 def other_pages():
-    """Figures of paper, notes, performance, late motors, and of the delay that a robot bears."""
+    """Figures of paper, notes, late motors, and of the delay that a robot bears."""
     losses = report("paper.json")["losses"]
     for traj, name in {"straight": "straight", "c": "C curve", "s": "S curve"}.items():
         cells, of = [], {who: x["L"] for who, x in losses[traj].items()}
@@ -477,18 +477,6 @@ def other_pages():
         yield notes, words.format(*cosines)
     straight = f"{rows['straight']['net']['cosine']['value']:.2f} at nominal on straight"
     yield DOCS / "decisions-tuning.md", straight
-
-    files = [report(f"performance/{name}.json") for name in ("qp_layer", "closed_loop", "exported")]
-    rows = {r[0]: r for f in files for section in f["sections"].values() for r in section["rows"]}
-    qp, many = rows["ours f64, lax.map"], rows["256 rollouts at once, 400 ticks"]
-    times = [qp[1], qp[3], rows["DAQP"][1], rows["jaxopt BoxOSQP 1e-5, lax.map"][3]]
-    told = [f"{time} us" for time in times]
-    told.append("{} ms, {} ms of processor time".format(*rows["CPU"][1:3]))
-    told.append("{} ms, {} ms; {} ms of processor time".format(*rows["hector"][1:4]))
-    told.append(f"{rows['1 rollout, 400 ticks, cold cache'][2]} s of processor time")
-    told.append(f"{float(many[2]):.0f} s of processor time, {float(many[3]):.1f} GiB")
-    page = (DOCS / "performance.md").read_text()
-    assert re.findall(r"^\|.* \| (.*) \|$", page, re.MULTILINE)[1:] == told
 
     for robot in ("quadruped", "quadruped-s", "humanoid"):
         numbers = report(f"delay/{robot}/delay.json")

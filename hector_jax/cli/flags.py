@@ -101,8 +101,7 @@ class Parallel(Flags):
     """A command that computes in several processes."""
 
     processes: Processes = 2  # worker processes, one core each
-    # HOST:PORT of a scheduler of dask.distributed, whose workers compute instead
-    cluster: str | None = None
+    cluster: str | None = None  # HOST:PORT of a scheduler of dask, whose workers compute instead
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -79,7 +79,7 @@ def cluster_workers(address: str) -> Iterator[Executor]:
     flag = f"--cluster {address}"
     require_package("distributed", "cluster", flag)
     from distributed import Client, KilledWorker
-    from distributed.comm import parse_address, parse_host_port
+    from distributed.comm.addressing import parse_address, parse_host_port
 
     try:
         parse_host_port(parse_address(address)[1])  # of a wrong one, `Client` leaves a thread
