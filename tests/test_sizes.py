@@ -31,9 +31,6 @@ def exactly(plant):
     return {name: [float(x).hex() for x in np.ravel(value)] for name, value in flat.items()}
 
 
-# Plants
-
-
 def factories(description):
     yield from (named_world(name, 2, description) for name in WORLDS)
     yield hfs_drawn(3, description=description)
@@ -60,9 +57,6 @@ def test_pushes_of_the_data_have_the_size_of_the_robot():
         np.testing.assert_allclose(one.imperfections.joint_friction, 3.0 * friction)
 
 
-# What the TOML says
-
-
 def test_sizes_and_loss_are_sections_of_the_robots_file(tmp_path):
     path = described(tmp_path, "[plants]\npush = 4\njoint_friction = 2.5\n[loss]\nL_ctrl = 0.05")
     description = read_description(path)
@@ -72,9 +66,6 @@ def test_sizes_and_loss_are_sections_of_the_robots_file(tmp_path):
     assert from_table("here", Description, to_table(description)) == description  # as in a dump
     plain = read_description(described(tmp_path, ""))
     assert (plain.plants, plain.loss) == (PlantSizes(), ())
-
-
-# The loss
 
 
 def test_a_fall_from_higher_up_costs_more():
