@@ -51,7 +51,7 @@ def test_the_description_of_hector_says_what_the_code_takes_by_default():
         ('"left_yaw", ', "", "joints: left and right must be 3 to 7 names each.*got 4 and 5"),
         ("linkage = [5, 4]", "linkage = [6, 4]", "joints: linkage must be two.*from 1 to 5"),
         ("l.euler = 50", "l.euler = [50, 0, 50]", r"nominal: euler must be a number.*got \[50, 0"),
-        ('model = "strider.xml"', "", "robot.toml: model is missing.*MJCF or URDF, beside"),
+        ('model = "strider.xml"', "", "robot.toml: model is missing.*MJCF or URDF beside"),
         ('"left_sole"', '"left_soul"', "no site 'left_soul'.*did you mean 'left_sole'?"),
     ],
 )

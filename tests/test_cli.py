@@ -84,7 +84,7 @@ def test_wrong_input_is_one_line_before_anything_is_computed(
 
 def test_a_robot_without_a_best_set_says_so(monkeypatch, capsys, tmp_path):
     robot = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
-    told = f"there is no {robot.with_name('robot-best.json')}; tune this robot"
+    told = f"no {robot.with_name('robot-best.json')}; tune this robot"
     for words in (
         ("walk", "--weights", "best"),
         ("tune", "--start", "best", "--out", tmp_path / "run"),

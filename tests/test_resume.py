@@ -230,7 +230,7 @@ def test_a_run_whose_data_are_elsewhere_is_refused_at_once(begun, tmp_path, monk
     [
         ({}, "--seeds 8", "run: begun with --seeds 3, got 8"),  # the default
         ({}, "--out other", "only one can be given"),
-        ({}, "--each", "run: no runs of single trajectories in it; leave out --each"),
+        ({}, "--each", "run: no runs of single trajectories; leave out --each"),
         ({"code": "another"}, "", "run: made by other code or other versions"),
         ({"robot": "another"}, "", "run: made for another robot"),
         (None, "", "run/config.json: cannot read a file of a run of"),

@@ -177,9 +177,7 @@ def run_robot(args: flags.Robot) -> None:
                 wrong.append(str(error))
         lines += section("mended", changes_of_model(robot))
     if file.suffix == ".toml" and proposal.filled:
-        lines += section(
-            "left out", [f"{', '.join(proposal.filled)}: HECTOR's, below by the rules"]
-        )
+        lines += section("left out", [f"{', '.join(proposal.filled)}: HECTOR's, by the rules"])
     print("\n".join([*lines, *section("wrong", [*told, *wrong])]))
     head = f"Proposed by `hector robot {file.name}`; rules: docs/robot-toml.md."
     comments = [head, *(f"To be mended: {line}" for line in [*told, *wrong] if wrong)]

@@ -34,10 +34,8 @@ def run_propose(args: Propose) -> None:
     campaign = _campaign(args)
     make_folder(args.folder)
     with locked(args.folder), workers(args.processes, args.cluster) as pool:
-        rows, space = (
-            reported_walks.read_reports(pool, campaign),
-            walks.campaign_space(pool, campaign),
-        )
+        rows = reported_walks.read_reports(pool, campaign)
+        space = walks.campaign_space(pool, campaign)
         proposal, _ = walks.next_proposal(pool, campaign, space, rows)
         if not path.exists():  # last, so that rejected flags can be corrected
             write_json(path, {"flags": as_table(args)})

@@ -41,9 +41,7 @@ _OF_OUR_CONTROLLER = "alpha data iterations net safe smooth variant verdict".spl
 
 def exists_error(folder: Path) -> InputError:
     """Return the error for a run folder that exists."""
-    return InputError(
-        f"run folder {folder} exists; continue it with --resume or name another with --out"
-    )
+    return InputError(f"run folder {folder} exists; --resume continues it, --out names another")
 
 
 def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
@@ -137,12 +135,8 @@ def resume(folder: Path, args: Tune) -> Tune:
     check_settings(folder, {name: config[name] for name in now}, now, f"{_REMEDY} ({commit})")
     flags = merge_flags(folder, begun, args, call_flags=_CALL_FLAGS)
     data = arguments.data_folder(flags.data, flags.robot, load_robot(flags.robot))
-    if (
-        not flags.walker
-        and not flags.net
-        and not data.exists()
-        and Path(config["directory"]) != Path.cwd()
-    ):
+    is_made = flags.walker or flags.net or data.exists()
+    if not is_made and Path(config["directory"]) != Path.cwd():
         raise InputError(
             f"{data}: no data here; the run was begun in {config['directory']}: resume it there, "
             "or name the folder by --data"
@@ -205,9 +199,7 @@ def by_folder(args: Tune, base: Path | None, robot: Robot) -> dict[Path, Tune]:
         if single and not args.each:
             raise InputError(f"{args.resume}: its trajectories were tuned one by one; add --each")
         if args.each and not single:
-            raise InputError(
-                f"{args.resume}: no runs of single trajectories in it; leave out --each"
-            )
+            raise InputError(f"{args.resume}: no runs of single trajectories; leave out --each")
         if not args.is_given("traj"):  # those of the run
             return dict.fromkeys(single if args.each else [args.resume], args)
     names = arguments.trajectories_by_name(args.traj)

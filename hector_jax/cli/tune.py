@@ -158,9 +158,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
             say(f"before any tuning, {first.name} on hfs: {line}")
         data = arguments.data_folder(args.data, args.robot, robot)
         net = given or nets.load_or_train(pool, robot, data, args.variant)
-        norms = tunings.mean_norms(
-            run.setup, {n: run.problems(net)[n] for n in ("without", "with")}
-        )
+        norms = tunings.mean_norms(run.setup, run.problems(net))
         if args.alpha == "auto":
             run = _with_aligned_loss(run, norms["with"])
         settings = _note_settings(run, net)
@@ -205,11 +203,10 @@ def _print(
 ) -> None:
     """Print the result of a run."""
     in_runs = Path("runs").resolve() in run.folder.resolve().parents
+    text = "latest" if in_runs else str(run.folder)
 
     def print_text() -> None:
-        print(
-            *first_lines(by_name[run.name], "latest" if in_runs else str(run.folder)), "", sep="\n"
-        )
+        print(*first_lines(by_name[run.name], text), "", sep="\n")
         for name, verdict in by_name.items():
             print_table(verdict, f"{name}, {plural(run.args.seeds, 'plant')}")
         if show_elsewhere:

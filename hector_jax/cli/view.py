@@ -64,9 +64,8 @@ def run_view(args: View) -> None:
 
     def motions() -> tuple[dict[str, Motion], str]:
         walks, description = walk()
-        return titled(
-            {name: motion(robot, v.walk, v.ground) for name, v in walks.items()}
-        ), description
+        shown = {name: motion(robot, v.walk, v.ground) for name, v in walks.items()}
+        return titled(shown), description
 
     if folder is not None:
         histories = read_histories(args.run)

@@ -54,9 +54,7 @@ def best(robot: Robot | None = None) -> Weights:
     toml = (HECTOR if robot is None else robot.description).path
     path = toml.with_name(f"{toml.stem}-best.json")
     if not path.exists():
-        raise InputError(
-            f"weights best: there is no {path}; tune this robot and name a file of its run"
-        )
+        raise InputError(f"weights best: no {path}; tune this robot and name a file of its run")
     return load_weights(path, robot)
 
 

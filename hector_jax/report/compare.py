@@ -55,9 +55,7 @@ def _verdict(run: Run, name: str) -> dict[str, Any]:
         _cells(name, verdict)  # raises if the file lacks a printed value
         return verdict
     except (KeyError, TypeError, AttributeError, ValueError):
-        raise InputError(
-            f"{Path(run.name) / RESULT}: set {name} has no verdict on the stand-in"
-        ) from None
+        raise InputError(f"{Path(run.name) / RESULT}: set {name} has no verdict") from None
 
 
 def _iterations(histories: Histories) -> dict[str, dict[str, int]]:

@@ -333,13 +333,9 @@ class _File:
         if not all(map(math.isfinite, angles)):
             raise InputError(f"standing must be finite angles, got {short_repr(self.standing)}")
         if not self.model:
-            raise InputError(
-                "model is missing, the name of the robot's MJCF or URDF, beside this file"
-            )
+            raise InputError("model is missing: the name of an MJCF or URDF beside this file")
         if Path(self.model).name != self.model:
-            raise InputError(
-                f"model must be the name of a file beside it, got {short_repr(self.model)}"
-            )
+            raise InputError(f"model must name a file beside it, got {short_repr(self.model)}")
 
 
 def read_description(path: Path) -> Description:

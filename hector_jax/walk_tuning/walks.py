@@ -196,7 +196,7 @@ def next_proposal(
     """
     if rows and not _stood(rows[0]):
         raise InputError(
-            f"{campaign.folder}: the start fell, or a QP was not solved; tune from another"
+            f"{campaign.folder}: the start fell or a QP was not solved; tune from another"
         )
     _, proposal = read_record(campaign)
     if proposal is not None:
