@@ -217,9 +217,12 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
     return with_given(from_table(str(path), kind, values), () if path.suffix == ".json" else values)
 
 
+_OF_THE_CALL = ("cluster", "config")  # of no result; the flags of a file are written out
+
+
 def as_table(flags: Any) -> dict[str, Any]:
     """Return the flags as JSON values, including those from a file; `from_file` reads them."""
-    names = [field.name for field in fields(flags) if field.name != "config"]
+    names = [field.name for field in fields(flags) if field.name not in _OF_THE_CALL]
     return {name: to_table(getattr(flags, name)) for name in names}
 
 
@@ -228,7 +231,7 @@ def as_command(program: str, flags: Any) -> str:
     words = program.split()
     for field in fields(flags):
         value, flag = getattr(flags, field.name), field.name.replace("_", "-")
-        if value == field.default or field.name == "config":  # its flags are written out
+        if value == field.default or field.name in _OF_THE_CALL:
             continue
         if isinstance(value, bool):
             words.append(f"--{'' if value else 'no-'}{flag}")
