@@ -41,6 +41,7 @@ class MujocoPlant(Plant):
         self._sensors = self.data.sensordata
         self._push = self.data.xfrc_applied[world.trunk, :3]
         self._flat = np.zeros(len(self._qpos) + len(self._qvel) + 1)
+        self._coordinates = np.split(self._flat, [len(self._qpos), -1])
 
     @property
     def broken(self) -> bool:
@@ -59,8 +60,8 @@ class MujocoPlant(Plant):
 
     def read(self, row: Float[np.ndarray, " reading"]) -> None:
         """See `Plant`."""
-        split = len(self._qpos)
-        self._flat[:split], self._flat[split:-1] = self._qpos, self._qvel
+        qpos, qvel, _ = self._coordinates
+        qpos[:], qvel[:] = self._qpos, self._qvel
         self._flat.take(self._reading_index, out=row, mode="clip")
 
     def ground(self) -> Ground:

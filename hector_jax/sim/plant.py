@@ -73,4 +73,4 @@ class PointContacts:
         rows, index = rows[foot >= 0], (step[foot >= 0], foot[foot >= 0])
         np.add.at(force, index, rows[:, 2:5])
         np.add.at(moment, index, np.cross(rows[:, 5:], rows[:, 2:5]))
-        return Ground(force, moment, Touches(other, legs))
+        return Ground(force, moment, np.zeros_like(moment), Touches(other, legs))

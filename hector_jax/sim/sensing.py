@@ -46,7 +46,8 @@ class Ground(NamedTuple):
     """Load of the ground on the feet over a millisecond, and other contacts."""
 
     force: Float[Array, "*batch feet 3"]  # [N] on each foot, world frame
-    moment: Float[Array, "*batch feet 3"]  # [N m] about the world's origin
+    moment: Float[Array, "*batch feet 3"]  # [N m] about `centre`
+    centre: Float[Array, "*batch feet 3"]  # [m] of each foot's contacts, or any other point
     touches: Touches
 
 
@@ -123,7 +124,7 @@ def ground_of(
     of_foot = (foot[None, :] == jnp.arange(feet)[:, None])[..., None]  # (feet, n, 1)
     foot_force = jnp.where(of_foot, force, 0.0)
     moment = jnp.cross(contacts.position, foot_force).sum(axis=1)
-    return Ground(foot_force.sum(axis=1), moment, touches)
+    return Ground(foot_force.sum(axis=1), moment, jnp.zeros_like(moment), touches)
 
 
 def sensed_ground(rows: Float[np.ndarray, "n sensors"], feet: int) -> Ground:
@@ -133,13 +134,11 @@ def sensed_ground(rows: Float[np.ndarray, "n sensors"], feet: int) -> Ground:
         rows: sensor data of each millisecond.
         feet: number of feet.
     """
-    count, force, torque, centre = np.split(
-        rows[:, :-2].reshape(len(rows), feet, -1), [1, 4, 7], axis=-1
-    )
-    floor, all_contacts = rows[:, -2:].T
-    touches = Touches(floor > count.sum(axis=(1, 2)), all_contacts > floor)
+    loads = rows[:, :-2].reshape(len(rows), feet, -1)
+    floor, contacts = rows[:, -2:].T
+    touches = Touches(floor > loads[:, :, 0].sum(axis=1), contacts > floor)
     # the sensors tell the load of the foot on the ground
-    return Ground(-force, -torque - np.cross(centre, force), touches)
+    return Ground(-loads[:, :, 1:4], -loads[:, :, 4:7], loads[:, :, 7:], touches)
 
 
 def measure(

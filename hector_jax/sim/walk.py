@@ -65,7 +65,8 @@ def _sampler(config: WalkConfig, constants: Layout, inputs: Layout) -> Callable[
         times = (ticks[:, None] + (1 + jnp.arange(count)) / count).ravel()
         anchors, yaws = jax.tree.map(lambda x: jnp.repeat(x, count, axis=0), (anchors, yaws))
 
-        def sample(anchor: Anchor, time, yaw, before, after, ground: Ground) -> Sample:
+        def sample(start: tuple[Anchor, Array, Array], after, points, ground: Ground) -> Sample:
+            anchor, time, yaw = start
             return loop.sample(
                 config,
                 robot,
@@ -74,11 +75,15 @@ def _sampler(config: WalkConfig, constants: Layout, inputs: Layout) -> Callable[
                 time=time,
                 yaw=yaw,
                 after=after,
-                effect=loop.contact_effect(robot, before, ground),
+                feet=points[1],
+                effect=loop.contact_effect(points[0], ground),
                 touches=ground.touches,
             )
 
-        return jax.vmap(sample)(anchors, times, yaws, readings[:-1], readings[1:], ground)
+        feet = jax.vmap(lambda row: sensing.foot_points(robot, sensing.unpack_reading(row)))
+        points = feet(readings)
+        points = jnp.stack([points[:-1], points[1:]], axis=1)  # at start and end of a millisecond
+        return jax.vmap(sample)((anchors, times, yaws), readings[1:], points, ground)
 
     return jax.jit(samples)
 
@@ -205,6 +210,7 @@ def _simulate(
     rows = np.zeros((steps + 1, 1 + 13 + 3 * joints + errors.shape[1]))
     rows[:, 0], rows[:-1, -errors.shape[1] :] = np.arange(steps + 1) % count, errors
     readings, clock, yaw = rows[:, 1 : -errors.shape[1]], np.int32(0), np.zeros(())
+    next_readings = readings[1:]
     plant.read(readings[0])
     body, command = jax.device_put((robot, with_pieces(job.command)))
     constants = body, _parameters(config, job.weights), command, job.imperfections
@@ -231,11 +237,11 @@ def _simulate(
             if torques is None:
                 of_inputs = layout((clock, *measured))
                 torques = _torques(config, of_constants, planner.layout, layout(state), of_inputs)
-            for _ in range(count):
-                packed_state = torques(packed_constants, packed, packed_state, rows[step])
-                plant.step(np.asarray(packed_state)[:joints], forces[step])
-                step += 1
-                plant.read(readings[step])
+            now, step = slice(step, step + count), step + count
+            for row, force, after in zip(rows[now], forces[now], next_readings[now], strict=True):
+                packed_state = torques(packed_constants, packed, packed_state, row)
+                plant.step(np.asarray(packed_state)[:joints], force)
+                plant.read(after)
             yaw = np.asarray(packed_state)[joints]
             if plant.broken:
                 break  # rare: the samples of less than a block are another program
