@@ -88,6 +88,11 @@ def _sampler(config: WalkConfig, constants: Layout, inputs: Layout) -> Callable[
     return jax.jit(samples)
 
 
+# Every call of a program sets up memory for each of its reductions, which takes longer than a short
+# one itself. For one of more than 32 numbers XLA would make two.
+_ONE_REDUCTION = {"xla_disable_hlo_passes": "tree_reduction_rewriter"}
+
+
 class _Planner:
     """The compiled plan of a tick, from packed trees to the packed memory and plan."""
 
@@ -108,7 +113,7 @@ class _Planner:
             self.layout = layout(result)
             return pack(result)
 
-        self.plan = jax.jit(plan)
+        self.plan = jax.jit(plan, compiler_options=_ONE_REDUCTION)
 
 
 _planner = cache(_Planner)
