@@ -89,7 +89,8 @@ def swing_path(
     rise = half * half * (3.0 - 2.0 * half)
     ends = jnp.where(s < 0.5, start[:, 2], end[:, 2] + parameters.landing)
     apex = jnp.maximum(start[:, 2], end[:, 2]) + parameters.height
-    return point.at[:, 2].set(ends + rise * (apex - ends))
+    height = ends + rise * (apex - ends)
+    return jnp.concatenate([point[:, :2], height[:, None]], axis=1)
 
 
 def swing_joints(

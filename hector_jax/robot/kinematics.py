@@ -17,6 +17,7 @@ thigh and shin, bent in the direction that the knee's limits allow.
 """
 
 from functools import partial
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import jax
@@ -162,7 +163,7 @@ def _chain(robot: Robot, joints: Float[Array, " joints"]) -> _Chain:
 
 
 def _closed_form_chain(leg: _Leg, joints: Float[Array, "5"]) -> _Chain:
-    pitches = jnp.cumsum(joints[2:])
+    pitches = jnp.stack([*accumulate(joints[2:])])
     cy, sy = jnp.cos(joints[0]), jnp.sin(joints[0])
     cr, sr = jnp.cos(joints[1]), jnp.sin(joints[1])
     cp, sp = jnp.cos(pitches), jnp.sin(pitches)
@@ -182,11 +183,9 @@ def _closed_form_chain(leg: _Leg, joints: Float[Array, "5"]) -> _Chain:
     frames = jnp.concatenate([R_yaw[None], R_roll[None], R_pitch])
     steps = jnp.concatenate([leg.origin[1:], leg.foot_point[None]])
     # o_yaw, o_roll, ..., o_ankle, foot: each point is the previous one plus a step in its frame
-    points = jnp.cumsum(
-        jnp.concatenate([leg.origin[:1], jnp.sum(frames * steps[:, None, :], axis=-1)]), axis=0
-    )
+    points = [*accumulate(jnp.sum(frames * steps[:, None, :], axis=-1), initial=leg.origin[0])]
     axis = jnp.stack([R_yaw[:, 2], ahead, side, side, side])
-    return _Chain(points[5], frames[4], points[:5], axis, frames)
+    return _Chain(points[5], frames[4], jnp.stack(points[:5]), axis, frames)
 
 
 def _closed_form_inverse(

@@ -19,7 +19,7 @@ from hector_jax.core.settings import NOT_NEGATIVE, POSITIVE, Range
 from hector_jax.robot.checks import expect
 
 TIME_STEP = 0.001  # [s] of plant, joint control and samples of every robot
-_MOST_BYTES = 1_000_000
+MOST_BYTES = 1_000_000
 _DEEPEST = 100
 _MOST_BODIES, _MOST_JOINTS = 2000, 200
 _URDF_PARTS = ("link", "joint", "material", "mujoco")  # of a robot; others are for other programs
@@ -55,7 +55,7 @@ def read_mjcf(path: Path) -> ElementTree.Element:
     Raises:
         InputError: one line naming the file and the first error in it.
     """
-    text = read_text(path, "the robot description", _MOST_BYTES)
+    text = read_text(path, "the robot description", MOST_BYTES)
     if match := re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
         raise InputError(f"{path}: {match[1].upper()} is not accepted, expected plain MJCF or URDF")
     try:

@@ -74,16 +74,14 @@ class Sample(NamedTuple):
     legs_touch: Bool[Array, "*batch"]
 
 
-def contact_effect(robot: Robot, before: Float[Array, " reading"], ground: Ground) -> Wrench:
+def contact_effect(points: Float[Array, "feet 3"], ground: Ground) -> Wrench:
     """Return the ground's wrench over a millisecond, its moments about the foot points.
 
     Args:
-        robot: nominal robot.
-        before: coordinates at the start of the millisecond.
+        points: of the feet at the start of the millisecond [m].
         ground: contacts in the millisecond.
     """
-    points = sensing.foot_points(robot, sensing.unpack_reading(before))
-    return Wrench(ground.force, ground.moment - jnp.cross(points, ground.force))
+    return Wrench(ground.force, ground.moment - jnp.cross(points - ground.centre, ground.force))
 
 
 def sample(
@@ -95,6 +93,7 @@ def sample(
     time: Float[Array, ""],
     yaw: Float[Array, ""],
     after: Float[Array, " reading"],
+    feet: Float[Array, "feet 3"],
     effect: Wrench,
     touches: Touches,
 ) -> Sample:
@@ -107,6 +106,7 @@ def sample(
         time: gait time at the end of the sample, in ticks.
         yaw: a true yaw [rad] shortly before.
         after: coordinates at the end of the sample.
+        feet: foot points there [m].
         effect: mean wrench of the ground over the sample.
         touches: contacts in the sample other than feet on the floor.
     """
@@ -116,7 +116,7 @@ def sample(
         state=state,
         reference=reference_at(config.gait.tick, command, anchor, time),
         effect=effect,
-        feet=sensing.foot_points(robot, reading),
+        feet=feet,
         joints=reading.joints + reading.slack,
         fallen=has_fallen(state, *robot.description.limits) | touches.floor,
         legs_touch=touches.legs,

@@ -2,17 +2,15 @@
 
 from collections.abc import Callable
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.core.arrays import Array
 from hector_jax.core.headless import mujoco
 from hector_jax.robot.model import Robot
 from hector_jax.sim import sensing
 from hector_jax.sim.loop import Job
 from hector_jax.sim.plant import Plant
-from hector_jax.sim.sensing import Ground, RawContacts
+from hector_jax.sim.sensing import Ground
 from hector_jax.sim.world import World, build_world, standing_qpos
 
 
@@ -32,16 +30,18 @@ class MujocoPlant(Plant):
 
         `on_step` is called after each step with the world.
         """
-        world = self.world = build_world(job.imperfections, body.description)
+        world = self.world = build_world(job.imperfections, body.description, sensors=True)
         self.data = mujoco.MjData(world.model)
         self.data.qpos[:] = standing_qpos(world, body.standing_joints, float(body.trunk_height))
-        self._contacts, self._steps = sensing.empty_contacts(end - first), 0
+        self._sensed, self._steps = np.zeros((end - first, world.model.nsensordata)), 0
+        self._feet = len(body.foot_point)
         self._reading_index, self._on_step = sensing.coordinates(world), on_step
-        self._place = jax.device_put((np.array(world.floor), world.foot_of_geom))
         # views that remain valid: each look-up in MjData costs half a microsecond
         self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
+        self._sensors = self.data.sensordata
         self._push = self.data.xfrc_applied[world.trunk, :3]
         self._flat = np.zeros(len(self._qpos) + len(self._qvel) + 1)
+        self._coordinates = np.split(self._flat, [len(self._qpos), -1])
 
     @property
     def broken(self) -> bool:
@@ -53,29 +53,18 @@ class MujocoPlant(Plant):
         self._ctrl[:] = torque
         self._push[:] = push
         mujoco.mj_step(self.world.model, self.data)
-        sensing.read_contacts(self.data, self._contacts, self._steps)
+        self._sensed[self._steps] = self._sensors
         self._steps += 1
         if self._on_step is not None:
             self._on_step(self.world, self.data)
 
     def read(self, row: Float[np.ndarray, " reading"]) -> None:
         """See `Plant`."""
-        split = len(self._qpos)
-        self._flat[:split], self._flat[split:-1] = self._qpos, self._qvel
+        qpos, qvel, _ = self._coordinates
+        qpos[:], qvel[:] = self._qpos, self._qvel
         self._flat.take(self._reading_index, out=row, mode="clip")
 
-    def ground(self) -> tuple[RawContacts, Array, Array]:
+    def ground(self) -> Ground:
         """See `Plant`."""
-        contacts = RawContacts(*(x[: self._steps] for x in self._contacts))
-        self._steps = 0
-        return contacts, *self._place
-
-    @staticmethod
-    def ground_of(robot: Robot, contacts: tuple[RawContacts, Array, Array]) -> Ground:
-        """See `Plant`."""
-
-        def ground_of(raw: RawContacts, floor: Array, foot_of_geom: Array) -> Ground:
-            feet = len(robot.foot_point)
-            return sensing.ground_of(sensing.contacts_of(raw, floor), floor, foot_of_geom, feet)
-
-        return jax.vmap(ground_of, in_axes=(0, None, None))(*contacts)
+        steps, self._steps = self._steps, 0
+        return sensing.sensed_ground(self._sensed[:steps], self._feet)

@@ -130,7 +130,8 @@ def _millisecond(
     contacts = jax.tree.map(widen, mjx_model.mjx_contacts(data))
     floor, foot_of_geom = jnp.asarray(places.floor), jnp.asarray(places.foot_of_geom)
     ground = sensing.ground_of(contacts, floor, foot_of_geom, len(robot.foot_point))
-    effect, touches = loop.contact_effect(robot, before, ground), ground.touches
+    points = sensing.foot_points(robot, sensing.unpack_reading(before))
+    effect, touches = loop.contact_effect(points, ground), ground.touches
     reading = sensing.unpack_reading(_read(program, walk, physics))
     fell = has_fallen(sensing.base_state(robot, reading, yaw), *robot.description.limits)
     fallen = carry.fallen | fell | touches.floor | mjx_model.in_floor(places, walk.model, data)
@@ -159,6 +160,7 @@ def _sample(
         time=time,
         yaw=carry.yaw,
         after=after,
+        feet=sensing.foot_points(walk.robot, sensing.unpack_reading(after)),
         effect=jax.tree.map(lambda w: w / program.period, carry.effect),
         touches=Touches(carry.fallen, carry.legs),
     )
@@ -221,6 +223,7 @@ def _init_carry(program: _Program, walk: _Walk, physics: _Physics) -> _Carry:
         time=1.0 * tick,
         yaw=yaw,
         after=reading,
+        feet=sensing.foot_points(robot, sensing.unpack_reading(reading)),
         effect=effect,
         touches=Touches(false, false),
     )

@@ -5,7 +5,6 @@ Details of an engine (geoms, solvers, contact models) stay behind it.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -32,17 +31,8 @@ class Plant(ABC):
         """Write the current coordinates, in the order of `sensing.Reading`, into `row`."""
 
     @abstractmethod
-    def ground(self) -> Any:
-        """Return the contacts of the n milliseconds since the last call, for `ground_of`."""
-
-    @staticmethod
-    def ground_of(robot: Robot, contacts: Any) -> Ground:
-        """Sum the contacts that `ground` returned, in JAX, to a Ground with a leading axis n.
-
-        The closed loop calls it within its compiled program of samples. By default `ground` has
-        summed them already.
-        """
-        return contacts
+    def ground(self) -> Ground:
+        """Return what the ground did in each of the n milliseconds since the last call."""
 
 
 BuildPlant = Callable[[Job, Robot, int, int], Plant]
@@ -83,4 +73,4 @@ class PointContacts:
         rows, index = rows[foot >= 0], (step[foot >= 0], foot[foot >= 0])
         np.add.at(force, index, rows[:, 2:5])
         np.add.at(moment, index, np.cross(rows[:, 5:], rows[:, 2:5]))
-        return Ground(force, moment, Touches(other, legs))
+        return Ground(force, moment, np.zeros_like(moment), Touches(other, legs))

@@ -15,15 +15,12 @@ from jaxtyping import Bool, Float, Int
 from hector_jax.control.legs import Measurement
 from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import euler_from_rotation, rotation_from_quaternion, wrap_angle
-from hector_jax.core.headless import mujoco
 from hector_jax.core.trajectory import State
 from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 from hector_jax.sim.world import Estimator, World
 
-_EDGES = np.arange(4)  # of a friction pyramid, in order
-CONTACTS = 16  # most contacts of a millisecond in MuJoCo C
 DRIFT_TIME = 4.0  # [s] after which the drift has its nominal size
 
 
@@ -49,7 +46,8 @@ class Ground(NamedTuple):
     """Load of the ground on the feet over a millisecond, and other contacts."""
 
     force: Float[Array, "*batch feet 3"]  # [N] on each foot, world frame
-    moment: Float[Array, "*batch feet 3"]  # [N m] about the world's origin
+    moment: Float[Array, "*batch feet 3"]  # [N m] about `centre`
+    centre: Float[Array, "*batch feet 3"]  # [m] of each foot's contacts, or any other point
     touches: Touches
 
 
@@ -61,19 +59,6 @@ class Contacts(NamedTuple):
     frame: Float[Array, "*batch n 3 3"]  # rows: normal from the first geom to the second, tangents
     pyramid: Float[Array, "*batch n 4"]  # [N] along the edges of the friction pyramid
     friction: Float[Array, "*batch n 2"]  # along the tangents
-
-
-class RawContacts(NamedTuple):
-    """Contacts of one step as they lie in MuJoCo C; `contacts_of` decodes them."""
-
-    size: Int[Array, "*batch"]  # number of contacts; n or less, else there is no room
-    geoms: Int[Array, "*batch n 2"]
-    position: Float[Array, "*batch n 3"]  # [m]
-    frame: Float[Array, "*batch n 9"]
-    friction: Float[Array, "*batch n 5"]
-    address: Int[Array, "*batch n"]  # first constraint; -1: left out of the constraints
-    first: Int[Array, "*batch"]  # constraint that `force` begins with
-    force: Float[Array, "*batch m"]  # [N] of the last constraints; contacts come last
 
 
 def coordinates(world: World) -> Int[np.ndarray, " reading"]:
@@ -139,51 +124,21 @@ def ground_of(
     of_foot = (foot[None, :] == jnp.arange(feet)[:, None])[..., None]  # (feet, n, 1)
     foot_force = jnp.where(of_foot, force, 0.0)
     moment = jnp.cross(contacts.position, foot_force).sum(axis=1)
-    return Ground(foot_force.sum(axis=1), moment, touches)
+    return Ground(foot_force.sum(axis=1), moment, jnp.zeros_like(moment), touches)
 
 
-def read_contacts(data: mujoco.MjData, out: RawContacts, row: int) -> None:
-    """Copy the contacts of the last step of MuJoCo C into a row of `out` (numpy)."""
-    # few calls: within a walk each takes several times as long as when it is repeated alone
-    count = out.size[row] = data.ncon
-    if 0 < count <= CONTACTS:
-        contact, force = data.contact, data.efc_force
-        out.geoms[row, :count] = contact.geom
-        out.position[row, :count] = contact.pos
-        out.frame[row, :count] = contact.frame
-        out.friction[row, :count] = contact.friction
-        out.address[row, :count] = contact.efc_address
-        first = out.first[row] = max(len(force) - out.force.shape[1], 0)
-        out.force[row, : len(force) - first] = force[first:]
+def sensed_ground(rows: Float[np.ndarray, "n sensors"], feet: int) -> Ground:
+    """Return the ground of n milliseconds from the contact sensors of a World (numpy).
 
-
-def empty_contacts(rows: int) -> RawContacts:
-    """Return room for the contacts of `rows` steps of MuJoCo C (numpy)."""
-    shapes = {"position": (3,), "frame": (9,), "friction": (5,)}
-    zeros = {name: np.zeros((rows, CONTACTS, *shape)) for name, shape in shapes.items()}
-    size, first = np.zeros((2, rows), int)
-    geoms, address = (np.zeros((rows, CONTACTS, *shape), np.int32) for shape in ((2,), ()))
-    force = np.zeros((rows, CONTACTS * len(_EDGES)))
-    return RawContacts(size=size, geoms=geoms, address=address, first=first, force=force, **zeros)
-
-
-def contacts_of(raw: RawContacts, floor: Int[Array, ""]) -> Contacts:
-    """Return the contacts of a step of MuJoCo C.
-
-    More than there is room for, which no walk has, are reported as a part on the floor that is no
-    foot.
+    Args:
+        rows: sensor data of each millisecond.
+        feet: number of feet.
     """
-    present = jnp.arange(len(raw.address)) < raw.size
-    crowded = raw.size > len(raw.address)
-    edges = raw.address[:, None] - raw.first + _EDGES
-    loaded = present & (raw.address >= 0)
-    return Contacts(
-        geoms=jnp.where(crowded, floor, jnp.where(present[:, None], raw.geoms, -1)),
-        position=raw.position,
-        frame=raw.frame.reshape(-1, 3, 3),
-        pyramid=jnp.where(loaded[:, None], raw.force[edges], 0.0),
-        friction=raw.friction[:, :2],
-    )
+    loads = rows[:, :-2].reshape(len(rows), feet, -1)
+    floor, contacts = rows[:, -2:].T
+    touches = Touches(floor > loads[:, :, 0].sum(axis=1), contacts > floor)
+    # the sensors tell the load of the foot on the ground
+    return Ground(-loads[:, :, 1:4], -loads[:, :, 4:7], loads[:, :, 7:], touches)
 
 
 def measure(

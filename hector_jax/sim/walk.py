@@ -12,7 +12,7 @@ from concurrent.futures import Executor
 from contextlib import suppress
 from functools import cache, partial
 from itertools import repeat
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,11 +22,11 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from hector_jax.control import controller
 from hector_jax.control.controller import Memory, Plan, WalkConfig
 from hector_jax.control.parameters import Parameters
-from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor, with_pieces
+from hector_jax.control.reference import Anchor, anchor_at, standing_anchor, with_pieces
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import Trajectory
-from hector_jax.core.tree import Layout, layout, pack, stack, unpack
+from hector_jax.core.tree import Layout, layout, pack, unpack
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot, quiet_mujoco
 from hector_jax.sim import loop, sensing
@@ -50,42 +50,47 @@ def _anchor(robot: Robot, reading: Array, yaw: Array, start_tick: Array) -> Anch
     return anchor_at(robot, state, start_tick)
 
 
-class _Block(NamedTuple):
-    """What the samples of a block of ticks are read from."""
+@cache
+def _sampler(config: WalkConfig, constants: Layout, inputs: Layout) -> Callable[..., Sample]:
+    """Compile the samples of a block of ticks.
 
-    anchors: Anchor  # (ticks, ...)
-    ticks: Array  # (ticks,), of the gait
-    yaws: Array  # (ticks,), at the start of each [rad]
-    readings: Array  # (milliseconds + 1, reading)
-    contacts: Any  # of the plant, for `Plant.ground_of`
-
-
-@partial(jax.jit, static_argnames=("config", "ground_of"))
-def _samples(
-    config: WalkConfig, robot: Robot, command: Command, block: _Block, *, ground_of: Any
-) -> Sample:
-    """Return the samples of a block of ticks."""
-
-    def sample(start: tuple[Anchor, Array, Array], before, after, ground: Ground) -> Sample:
-        anchor, time, yaw = start
-        return loop.sample(
-            config,
-            robot,
-            command=command,
-            anchor=anchor,
-            time=time,
-            yaw=yaw,
-            after=after,
-            effect=loop.contact_effect(robot, before, ground),
-            touches=ground.touches,
-        )
-
-    anchors, ticks, yaws, readings, contacts = block
+    The program takes the packed constants and inputs of the plans, the readings of all milliseconds
+    from the start of the block on, and what the ground does in each.
+    """
     count = substeps(config)
-    times = (ticks[:, None] + (1 + jnp.arange(count)) / count).ravel()
-    anchors, yaws = jax.tree.map(lambda x: jnp.repeat(x, count, axis=0), (anchors, yaws))
-    ground = ground_of(robot, contacts)
-    return jax.vmap(sample)((anchors, times, yaws), readings[:-1], readings[1:], ground)
+
+    def samples(packed: Array, plans: Array, readings: Array, ground: Ground) -> Sample:
+        robot, _, command, _ = unpack(constants, packed)
+        anchors, ticks, _, yaws, *_ = unpack(inputs, plans)
+        times = (ticks[:, None] + (1 + jnp.arange(count)) / count).ravel()
+        anchors, yaws = jax.tree.map(lambda x: jnp.repeat(x, count, axis=0), (anchors, yaws))
+
+        def sample(start: tuple[Anchor, Array, Array], after, points, ground: Ground) -> Sample:
+            anchor, time, yaw = start
+            return loop.sample(
+                config,
+                robot,
+                command=command,
+                anchor=anchor,
+                time=time,
+                yaw=yaw,
+                after=after,
+                feet=points[1],
+                effect=loop.contact_effect(points[0], ground),
+                touches=ground.touches,
+            )
+
+        feet = jax.vmap(lambda row: sensing.foot_points(robot, sensing.unpack_reading(row)))
+        points = feet(readings)
+        points = jnp.stack([points[:-1], points[1:]], axis=1)  # at start and end of a millisecond
+        return jax.vmap(sample)((anchors, times, yaws), readings[1:], points, ground)
+
+    return jax.jit(samples)
+
+
+# Every call of a program sets up memory for each of its reductions, which takes longer than a short
+# one itself. For one of more than 32 numbers XLA would make two.
+_ONE_REDUCTION = {"xla_disable_hlo_passes": "tree_reduction_rewriter"}
 
 
 class _Planner:
@@ -108,7 +113,7 @@ class _Planner:
             self.layout = layout(result)
             return pack(result)
 
-        self.plan = jax.jit(plan)
+        self.plan = jax.jit(plan, compiler_options=_ONE_REDUCTION)
 
 
 _planner = cache(_Planner)
@@ -182,8 +187,7 @@ def walk(
     count, ticks = substeps(config), loop.walk_ticks(config, job.seconds, job.start_tick)
     lead, length = (job.start_tick - first_tick(config)) * count, ticks * count
     plant = build(job, job.body(robot), -lead, length)
-    blocks = zip(*_walk_blocks(config, robot, job, plant, ticks=ticks), strict=True)
-    plan, flat = (jax.tree.map(lambda *x: np.concatenate(x), *trees) for trees in blocks)
+    plan, flat = _simulate(config, robot, job, plant, ticks=ticks)
     # from a fall on, samples repeat the last valid one
     fell, good = np.flatnonzero(flat.fallen), len(flat.fallen) - 1
     if len(fell):
@@ -198,10 +202,10 @@ def walk(
     return loop.as_trajectory(np.array(TIME_STEP), initial, plan, chosen)
 
 
-def _walk_blocks(
+def _simulate(
     config: WalkConfig, robot: Robot, job: Job, plant: Plant, *, ticks: int
-) -> Iterator[tuple[Plan, Sample]]:
-    """Yield plans and samples of each block of ticks (numpy), until t = `ticks` or a fall."""
+) -> tuple[Plan, Sample]:
+    """Return the plans of all ticks and the samples (numpy), until t = `ticks` or a fall."""
     count, first = substeps(config), first_tick(config)
     start, steps = job.start_tick, (job.start_tick - first + ticks) * count
     joints, lead = len(robot.joint_lower), steps - ticks * count
@@ -211,6 +215,7 @@ def _walk_blocks(
     rows = np.zeros((steps + 1, 1 + 13 + 3 * joints + errors.shape[1]))
     rows[:, 0], rows[:-1, -errors.shape[1] :] = np.arange(steps + 1) % count, errors
     readings, clock, yaw = rows[:, 1 : -errors.shape[1]], np.int32(0), np.zeros(())
+    next_readings = readings[1:]
     plant.read(readings[0])
     body, command = jax.device_put((robot, with_pieces(job.command)))
     constants = body, _parameters(config, job.weights), command, job.imperfections
@@ -220,38 +225,36 @@ def _walk_blocks(
     trees = anchor, constants, state, memory
     packed_anchor, packed_constants, packed_state, packed = map(_pack, trees)
     planner_for = cache(partial(_planner, config, of_constants, of_inputs))
-    memory_size = packed.size
+    sampled = _sampler(config, of_constants, of_inputs)
+    memory_size, inputs, plans, samples = packed.size, [], [], []
     torques, planner, step = None, None, 0
-    while step < steps:
-        begin, plans, at_start = step, [], []
+    while step < steps and not (plant.broken or samples and samples[-1].fallen.any()):
+        begin = step
         for _ in range(_BLOCK if steps - step >= _BLOCK * count else 1):
             tick, reading = first + step // count, readings[step]
             if tick == start:
-                anchor = _anchor(body, reading, yaw, start)
-                packed_anchor = _pack(anchor)
-            at_start.append((anchor, np.int32(tick), yaw))
+                packed_anchor = _pack(_anchor(body, reading, yaw, start))
             planner = planner_for(controller.contacts_needed(config, tick))
-            inputs = packed_anchor, [tick], np.asarray(packed)[:memory_size], [yaw], rows[step, 1:]
-            packed = planner.plan(packed_constants, np.concatenate(inputs))
+            parts = packed_anchor, [tick], np.asarray(packed)[:memory_size], [yaw], rows[step, 1:]
+            inputs.append(np.concatenate(parts))
+            packed = planner.plan(packed_constants, inputs[-1])
             plans.append(np.asarray(packed))
             if torques is None:
                 of_inputs = layout((clock, *measured))
                 torques = _torques(config, of_constants, planner.layout, layout(state), of_inputs)
-            for _ in range(count):
-                packed_state = torques(packed_constants, packed, packed_state, rows[step])
-                plant.step(np.asarray(packed_state)[:joints], forces[step])
-                step += 1
-                plant.read(readings[step])
+            now, step = slice(step, step + count), step + count
+            for row, force, after in zip(rows[now], forces[now], next_readings[now], strict=True):
+                packed_state = torques(packed_constants, packed, packed_state, row)
+                plant.step(np.asarray(packed_state)[:joints], force)
+                plant.read(after)
             yaw = np.asarray(packed_state)[joints]
             if plant.broken:
                 break  # rare: the samples of less than a block are another program
-        anchors, ticks_done, yaws = stack(at_start)
-        block = _Block(anchors, ticks_done, yaws, readings[begin : step + 1], plant.ground())
-        samples = _samples(config, body, command, block, ground_of=plant.ground_of)
-        assert planner is not None  # it has planned
-        yield unpack(planner.layout, np.stack(plans))[1], jax.tree.map(np.asarray, samples)
-        if plant.broken or np.asarray(samples.fallen).any():
-            return
+        block = np.stack(inputs[begin // count :]), readings[begin : step + 1], plant.ground()
+        samples.append(jax.tree.map(np.asarray, sampled(packed_constants, *block)))
+    assert planner is not None  # it has planned
+    plan = unpack(planner.layout, np.stack(plans))[1]
+    return plan, jax.tree.map(lambda *x: np.concatenate(x), *samples)
 
 
 def on_host(job: Job) -> Job:

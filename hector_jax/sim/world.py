@@ -12,7 +12,7 @@ name, so that nothing depends on the number of joints.
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -21,10 +21,10 @@ from jaxtyping import Float, Int
 
 from hector_jax.core.arrays import Array
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import InputError, unknown
+from hector_jax.core.inputs import InputError, read_text, unknown
 from hector_jax.robot.checks import expect
 from hector_jax.robot.description import HECTOR, Description
-from hector_jax.robot.mjcf import TIME_STEP
+from hector_jax.robot.mjcf import MOST_BYTES, TIME_STEP
 from hector_jax.robot.model import build_model, quiet_mujoco
 
 LINE_SEARCH = 50  # of the solver, steps; with 10 the hfs is off by 0.02 rad/s in 1 of 400 steps
@@ -32,6 +32,8 @@ MAX_DELAY = 0.008  # [s] that the motors' memory can hold
 MOTOR_DELAY, MOTOR_LAG = (0.001, 0.005), (0.002, 0.006)  # [s] of the motors that robots have
 SLACK = "_backlash"  # suffix of the names of backlash joints
 SLACK_DAMPING = 0.01  # [N m s/rad] of a backlash joint
+_SENSED = ("FOUND", "FORCE", "TORQUE", "POS")  # of a contact sensor
+_NET_FORCE = 3  # the way of a contact sensor to sum up contacts
 STOP_TIME = 0.004  # [s] solref of the backlash's end stops: gear teeth are hard
 
 
@@ -245,8 +247,28 @@ def _check(imperfections: Imperfections) -> None:
         raise InputError(f"Imperfections.delay is at most {MAX_DELAY} s, got {imperfections.delay}")
 
 
-def _model(description: Description, slack: bool) -> mujoco.MjModel:
-    spec, _ = build_model(description)
+def _add_contact_sensors(spec: mujoco.MjSpec, feet: Sequence[mujoco.MjsBody]) -> None:
+    """Add the sensors that `sensing.sensed_ground` reads.
+
+    For each foot the number of its contacts with the floor, their force, torque and centre; then
+    the number of contacts of the floor, and of all.
+    """
+    kinds, names = mujoco.mjtObj, mujoco.mjtConDataField
+    found, *wrench = (1 << int(getattr(names, f"mjCONDATA_{name}")) for name in _SENSED)
+    for number, foot in enumerate(feet):
+        foot.name = foot.name or f"foot {number}"
+    load = [found + sum(wrench), _NET_FORCE, 1]
+    pairs = [(foot.name, "world", load) for foot in feet]
+    for body, other, data in (*pairs, ("world", "", [found, 0, 1]), ("", "", [found, 0, 1])):
+        sensor = spec.add_sensor(type=mujoco.mjtSensor.mjSENS_CONTACT, intprm=data)
+        sensor.objname, sensor.refname = body, other
+        sensor.objtype, sensor.reftype = (
+            kinds.mjOBJ_BODY if name else kinds.mjOBJ_UNKNOWN for name in (body, other)
+        )
+
+
+def _model(description: Description, slack: bool, sensors: bool) -> mujoco.MjModel:
+    (spec, _), joints = build_model(description), description.joints
     # purely visual geoms, which give their body no mass, cost time and memory in every plant
     for geom in list(spec.geoms):
         geom.material = ""
@@ -254,9 +276,12 @@ def _model(description: Description, slack: bool) -> mujoco.MjModel:
             spec.delete(geom)
     for visual in (*spec.materials, *spec.textures):
         spec.delete(visual)
+    if sensors:
+        count = description.leg_joints
+        _add_contact_sensors(spec, [spec.joint(name).parent for name in joints[count - 1 :: count]])
     if not slack:
         return spec.compile()
-    for name in description.joints:
+    for name in joints:
         motor = spec.joint(name)
         motor.parent.add_joint(
             name=name + SLACK,
@@ -276,8 +301,10 @@ def _model(description: Description, slack: bool) -> mujoco.MjModel:
     return spec.compile()
 
 
-def _compile(description: Description, slack: bool) -> World:
-    model, names = _model(description, slack), description.joints
+@lru_cache(maxsize=8)  # a walk takes less than twenty times as long as this
+def _compile(description: Description, slack: bool, sensors: bool, text: str) -> World:
+    """Compile the model of a description; `text` is that of its file, which may change."""
+    model, names = _model(description, slack, sensors), description.joints
     floors = [g for g in range(model.ngeom) if model.geom_bodyid[g] == 0 and model.geom_contype[g]]
     text = f"expected one floor that collides, got {len(floors)}"
     expect(description.model, len(floors) == 1, text)
@@ -321,27 +348,35 @@ def _with_numbers(world: World, imperfections: Imperfections) -> World:
 
 @quiet_mujoco()
 def build_worlds(
-    imperfections: Sequence[Imperfections], description: Description | None = None
+    imperfections: Sequence[Imperfections],
+    description: Description | None = None,
+    *,
+    sensors: bool = False,
 ) -> list[World]:
     """Build the MuJoCo models of several plants.
 
     Args:
         imperfections: of each plant; `backlash` above zero adds a hinge for each joint.
         description: of the robot, HECTOR by default.
+        sensors: with sensors of contact, which MJX does not have.
 
     Raises:
         InputError: the file is not the robot, or a number is out of its range.
     """
     for plant in imperfections:
         _check(plant)
+    description = description or HECTOR
+    text = read_text(description.model, "the robot description", MOST_BYTES)
     slack = [bool(plant.backlash > 0.0) for plant in imperfections]
-    compiled = {value: _compile(description or HECTOR, value) for value in set(slack)}
-    return [_with_numbers(compiled[s], p) for s, p in zip(slack, imperfections, strict=True)]
+    worlds = (_compile(description, value, sensors, text) for value in slack)
+    return [_with_numbers(w, p) for w, p in zip(worlds, imperfections, strict=True)]
 
 
-def build_world(imperfections: Imperfections, description: Description | None = None) -> World:
+def build_world(
+    imperfections: Imperfections, description: Description | None = None, *, sensors: bool = False
+) -> World:
     """Build the MuJoCo model of one plant; see `build_worlds`."""
-    return build_worlds([imperfections], description)[0]
+    return build_worlds([imperfections], description, sensors=sensors)[0]
 
 
 def standing_qpos(
