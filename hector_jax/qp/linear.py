@@ -38,7 +38,8 @@ def plus_gram(P: Array, A: Array, w: Array) -> Array:
 
 def cholesky(matrix: Array) -> Array:
     """Return the lower Cholesky factor of a symmetric matrix; NaN if not positive definite."""
-    return lax.linalg.cholesky(jnp.asarray(matrix), symmetrize_input=False)
+    # LAPACK reads columns: the transpose of rows, which needs no copy
+    return lax.linalg.cholesky(jnp.asarray(matrix).T, symmetrize_input=False)
 
 
 def largest(v: Array) -> Array:

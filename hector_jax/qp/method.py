@@ -192,8 +192,8 @@ def solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, Normal]:
     """Solve a QP. Returns the solution, W (2, m) of its derivative and the normalised problem."""
     tolerances = config.tolerances(qp.q.dtype)
     no_bound = jnp.isnan(qp.l) | jnp.isnan(qp.u) | (qp.l >= INFINITE) | (qp.u <= -INFINITE)
-    numbers = jnp.maximum(jnp.maximum(largest(qp.P), largest(qp.q)), largest(qp.A))
-    valid = jnp.isfinite(numbers) & ~jnp.any(no_bound)
+    finite = [jnp.all(jnp.isfinite(v)) for v in (qp.P, qp.q, qp.A)]
+    valid = finite[0] & finite[1] & finite[2] & ~jnp.any(no_bound)
     # a trivial QP replaces an invalid one, so that no NaN reaches the solver
     trivial = QP(jnp.eye(len(qp.q), dtype=qp.q.dtype), *(jnp.zeros_like(v) for v in qp[1:]))
     normal = normalise(tolerances, where(valid, qp, trivial))
