@@ -28,7 +28,6 @@ class _Fixed(NamedTuple):
 
     tolerances: Tolerances
     qp: Normal
-    equality: Array  # (2, m) bool: the single side of an equality, which is always active
     limit: Array  # largest number of iterations
 
 
@@ -43,7 +42,7 @@ class _Loop(NamedTuple):
 
 def _correct(fixed: _Fixed, state: _Loop) -> _Loop:
     """Run a pass of the method of multipliers, which removes six digits, and change wrong sides."""
-    (tolerances, qp, equality, _), (x, z), active = fixed, state.point, state.active
+    (tolerances, qp, _), (x, z), active = fixed, state.point, state.active
     weight = jnp.where(active, jnp.asarray(tolerances.cap, x.dtype), 0.0)
     z = jnp.where(active, z, 0.0) + weight * qp.violation(x)
     slope = qp.P @ x + qp.q + rmatvec(qp.A, multiplier(z))
@@ -51,7 +50,7 @@ def _correct(fixed: _Fixed, state: _Loop) -> _Loop:
     x, z = x + dx, z + weight * SIGN * matvec(qp.A, dx)
     outside = qp.violation(x)
     negative, violated = z < -tolerances.rounding, outside > tolerances.rounding * qp.row_sizes(x)
-    wrong = jnp.where(active, negative, violated) & ~equality
+    wrong = jnp.where(active, negative, violated) & ~qp.equality
     changed = worst_sides(qp, wrong, active, jnp.where(active, -z, outside))
     # a failed factorisation is repeated with a larger rho
     finite = jnp.isfinite(largest(x))
@@ -71,8 +70,8 @@ def _runs(fixed: _Fixed, state: _Loop) -> Array:
 def _improve(fixed: _Fixed, state: _Loop) -> _Loop:
     """Factorise for the current active set, and correct it."""
     qp = fixed.qp
-    weight = jnp.where(jnp.any(state.active, axis=0), fixed.tolerances.cap, 0.0)
-    factor = cholesky(plus_gram(qp.P, qp.A, weight.astype(qp.q.dtype), state.rho))
+    weight = fixed.tolerances.cap * jnp.sum(state.active, axis=0, dtype=qp.q.dtype)
+    factor = cholesky(plus_gram(qp.P, qp.A, weight, state.rho))
     return _correct(fixed, state._replace(factor=factor, iterations=state.iterations + 1))
 
 
@@ -94,18 +93,20 @@ def active_set(
         number of iterations.
     """
     dtype = qp.q.dtype
-    equality = jnp.zeros_like(qp.side).at[0].set(qp.equality)
-    fixed = _Fixed(tolerances, qp, equality, limit)
+    # the single side of an equality, which is always active
+    equality = jnp.stack([qp.equality, jnp.zeros_like(qp.equality)])
+    fixed = _Fixed(tolerances, qp, limit)
     runs = partial(_runs, fixed)
 
     def converge(state: tuple[_Loop, Point, Array]) -> tuple[_Loop, Point, Array]:
         """Iterate until no side is wrong, then run another pass and compute residuals."""
         loop, best, residuals = state
-        loop = _correct(fixed, lax.while_loop(runs, partial(_improve, fixed), loop))
+        loop = lax.while_loop(runs, partial(_improve, fixed), loop)
+        converged, loop = ~loop.running, _correct(fixed, loop)
         x, z = loop.point  # clipped at zero, except multipliers of equalities, which have no sign
         point = Point(x, jnp.where(equality, z, jnp.maximum(z, 0.0)))
         found = point, qp.residuals(point)
-        better = jnp.max(found[1]) < jnp.max(residuals)
+        better = converged & (jnp.max(found[1]) < jnp.max(residuals))
         best, residuals = where(better, found, (best, residuals))
         # with a flat P more iterations improve the point even if the active set does not change
         running = loop.running | (jnp.max(residuals) > tolerances.target)
