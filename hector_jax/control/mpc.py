@@ -274,10 +274,12 @@ def half_hessian(
     overlap = later.T @ later  # number of steps that two inputs both affect
     turning = wide.T @ (jnp.tile(Q.euler, N)[:, None] * wide)
     turning += jnp.kron(overlap, jnp.diag(Q.ang_velocity))
-    spin = block_diagonal(turn)
+    turned = contract("ixjy,jyb->ixjb", turning.reshape(N, 3, N, 3), turn)
     pushing = overlap[..., None] * Q.velocity + (travel.T @ travel)[..., None] * Q.position
-    pushed = contract("ixa,ixjb->iajb", push, contract("ijx,jxb->ixjb", pushing, push))
-    P = spin.T @ (turning @ spin) + pushed.reshape(N * b, N * b) + block_diagonal(effort)
+    pushed = contract("ijx,jxb->ixjb", pushing, push)
+    change, changed = jnp.concatenate([turn, push], 1), jnp.concatenate([turned, pushed], 1)
+    P = jnp.einsum("ixa,ixjb->iajb", change, changed).reshape(N * b, N * b)
+    P += block_diagonal(effort)
     if own is not None:
         A, _, weight = own
         P += A.T @ (weight[:, None] * A)

@@ -19,7 +19,7 @@ from hector_jax.core.arrays import Array
 from hector_jax.core.console import say
 from hector_jax.core.tree import where
 from hector_jax.qp.certificates import curvature
-from hector_jax.qp.linear import cholesky, matvec, multiplier, plus_gram, rmatvec
+from hector_jax.qp.linear import cholesky, largest, matvec, multiplier, plus_gram, rmatvec
 from hector_jax.qp.problem import SIGN, Normal, Point, Start, Tolerances
 
 
@@ -28,74 +28,51 @@ class _Fixed(NamedTuple):
 
     tolerances: Tolerances
     qp: Normal
-    equality: Array  # (2, m) bool: the single side of an equality, which is always active
-    eye: Array
+    limit: Array  # largest number of iterations
 
 
 class _Loop(NamedTuple):
     point: Point
     active: Array  # (2, m) bool
-    best: Point
-    residuals: Array  # (3,) of the best point
+    factor: Array  # of the matrix of the active set before its last change
     rho: Array
     iterations: Array
     running: Array
 
 
-_Corrected = tuple[Point, Array, Array]  # point, wrong sides (2, m) and their error (2, m)
-
-
-def _signed(fixed: _Fixed, z: Array) -> Array:
-    """Clip multipliers at zero except those of equalities, which have no sign."""
-    return jnp.where(fixed.equality, z, jnp.maximum(z, 0.0))
-
-
-def _correct(
-    fixed: _Fixed, active: Array, weight: Array, factor: Array, point: Point
-) -> _Corrected:
-    """Run one pass of the method of multipliers, which removes six digits of the error."""
-    qp, (x, z), rounding = fixed.qp, point, fixed.tolerances.rounding
-    z = z + weight * qp.violation(x)
+def _correct(fixed: _Fixed, state: _Loop) -> _Loop:
+    """Run a pass of the method of multipliers, which removes six digits, and change wrong sides."""
+    (tolerances, qp, _), (x, z), active = fixed, state.point, state.active
+    weight = jnp.where(active, jnp.asarray(tolerances.cap, x.dtype), 0.0)
+    z = jnp.where(active, z, 0.0) + weight * qp.violation(x)
     slope = qp.P @ x + qp.q + rmatvec(qp.A, multiplier(z))
-    dx = -cho_solve((factor, True), slope)
+    dx = -cho_solve((state.factor, True), slope)
     x, z = x + dx, z + weight * SIGN * matvec(qp.A, dx)
     outside = qp.violation(x)
-    negative, violated = z < -rounding, outside > rounding * qp.row_sizes(x)
-    wrong = jnp.where(active, negative, violated) & ~fixed.equality
-    return Point(x, z), wrong, jnp.where(active, -z, outside)
-
-
-def _improve(fixed: _Fixed, limit: Array, state: _Loop) -> _Loop:
-    """Factorise for the current active set, and change the wrong sides."""
-    tolerances, qp, *_ = fixed
-    dtype = qp.q.dtype
-    weight = jnp.where(state.active, jnp.asarray(tolerances.cap, dtype), 0.0)
-    matrix = plus_gram(qp.P + state.rho * fixed.eye, qp.A, weight[0] + weight[1])
-    correct = partial(_correct, fixed, state.active, weight, cholesky(matrix))
-
-    def refine() -> tuple[_Corrected, Array]:
-        """Run another pass and compute residuals, for an active set without wrong sides."""
-        refined = correct(first[0])
-        return refined, qp.residuals(refined[0]._replace(z=_signed(fixed, refined[0].z)))
-
-    first = correct(Point(state.point.x, jnp.where(state.active, state.point.z, 0.0)))
-    infinite = jnp.full(3, jnp.inf, dtype)
-    corrected, residuals = lax.cond(jnp.any(first[1]), lambda: (first, infinite), refine)
-    (x, z), wrong, error = corrected
-    changed = worst_sides(qp, wrong, state.active, error)
-    point = Point(x, _signed(fixed, z))
-    better = jnp.max(residuals) < jnp.max(state.residuals)
-    best, residuals = where(better, (point, residuals), (state.best, state.residuals))
+    negative, violated = z < -tolerances.rounding, outside > tolerances.rounding * qp.row_sizes(x)
+    wrong = jnp.where(active, negative, violated) & ~qp.equality
+    changed = worst_sides(qp, wrong, active, jnp.where(active, -z, outside))
     # a failed factorisation is repeated with a larger rho
-    finite = jnp.isfinite(jnp.sum(x) + jnp.sum(z))
+    finite = jnp.isfinite(largest(x))
     point = where(finite, Point(x, z), state.point)
-    active = where(finite, state.active ^ changed, state.active)
-    rho = jnp.where(finite, state.rho, 100.0 * state.rho)
-    iterations = state.iterations + 1
-    # with a flat P more iterations improve the point even if the active set does not change
-    running = ~finite | jnp.any(wrong) | (jnp.max(residuals) > tolerances.target)
-    running &= (rho < 1.0) & (iterations < limit)
-    return _Loop(point, active, best, residuals, rho, iterations, running)
+    return state._replace(
+        point=point,
+        active=active ^ (changed & finite),
+        rho=jnp.where(finite, state.rho, 100.0 * state.rho),
+        running=~finite | jnp.any(changed),
+    )
+
+
+def _runs(fixed: _Fixed, state: _Loop) -> Array:
+    return state.running & (state.rho < 1.0) & (state.iterations < fixed.limit)
+
+
+def _improve(fixed: _Fixed, state: _Loop) -> _Loop:
+    """Factorise for the current active set, and correct it."""
+    qp = fixed.qp
+    weight = fixed.tolerances.cap * jnp.sum(state.active, axis=0, dtype=qp.q.dtype)
+    factor = cholesky(plus_gram(qp.P, qp.A, weight, state.rho))
+    return _correct(fixed, state._replace(factor=factor, iterations=state.iterations + 1))
 
 
 def active_set(
@@ -116,19 +93,36 @@ def active_set(
         number of iterations.
     """
     dtype = qp.q.dtype
-    equality = jnp.zeros_like(qp.side).at[0].set(qp.equality)
-    fixed = _Fixed(tolerances, qp, equality, jnp.eye(len(qp.q), dtype=dtype))
+    # the single side of an equality, which is always active
+    equality = jnp.stack([qp.equality, jnp.zeros_like(qp.equality)])
+    fixed = _Fixed(tolerances, qp, limit)
+    runs = partial(_runs, fixed)
+
+    def converge(state: tuple[_Loop, Point, Array]) -> tuple[_Loop, Point, Array]:
+        """Iterate until no side is wrong, then run another pass and compute residuals."""
+        loop, best, residuals = state
+        loop = lax.while_loop(runs, partial(_improve, fixed), loop)
+        converged, loop = ~loop.running, _correct(fixed, loop)
+        x, z = loop.point  # clipped at zero, except multipliers of equalities, which have no sign
+        point = Point(x, jnp.where(equality, z, jnp.maximum(z, 0.0)))
+        found = point, qp.residuals(point)
+        better = converged & (jnp.max(found[1]) < jnp.max(residuals))
+        best, residuals = where(better, found, (best, residuals))
+        # with a flat P more iterations improve the point even if the active set does not change
+        running = loop.running | (jnp.max(residuals) > tolerances.target)
+        return loop._replace(running=running), best, residuals
+
     begin = _Loop(
         start,
         (active & qp.side) | equality,
-        start,
-        jnp.full(3, jnp.inf, dtype),
+        jnp.zeros_like(qp.P),
         jnp.asarray(tolerances.proximal, dtype),
         jnp.zeros((), jnp.int32),
         enabled,
     )
-    end = lax.while_loop(lambda state: state.running, partial(_improve, fixed, limit), begin)
-    return end.best, end.residuals, end.iterations
+    first = begin, start, jnp.full(3, jnp.inf, dtype)
+    loop, best, residuals = lax.while_loop(lambda state: runs(state[0]), converge, first)
+    return best, residuals, loop.iterations
 
 
 def worst_sides(qp: Normal, wrong: Array, active: Array, error: Array) -> Array:
@@ -161,8 +155,7 @@ def first_guess(tolerances: Tolerances, qp: Normal) -> Start:
     infinite = jnp.full(3, jnp.inf, qp.q.dtype)
 
     def violated(qp: Normal) -> Start:
-        factor, definite, convex = curvature(tolerances, qp)
-        x = -cho_solve((factor, True), qp.q)
+        x, definite, convex = curvature(tolerances, qp)
         outside, none = qp.violation(x), jnp.zeros_like(qp.side)
         active = worst_sides(qp, outside > 0, none, outside)
         return Start(Point(x, none.astype(x.dtype)), active, infinite, definite, convex)

@@ -23,14 +23,19 @@ def _shifted(matrix: Array, shift: float) -> tuple[Array, Array]:
 
 
 def curvature(tolerances: Tolerances, qp: Normal) -> tuple[Array, Array, Array]:
-    """Return a Cholesky factor of P, whether P is definite and whether it is semidefinite.
+    """Return the minimiser without rows, whether P is definite and whether it is semidefinite.
 
     A definite P takes one factorisation.
     """
-    factor, definite = _shifted(qp.P, -tolerances.curvature)
-    proximal = lambda qp: _shifted(qp.P, tolerances.proximal)  # noqa: E731
-    factor, convex = only_if(~definite, proximal, (factor, definite), qp)
-    return factor, definite, convex
+
+    def minimise(qp: Normal, shift: float) -> tuple[Array, Array]:
+        factor, exists = _shifted(qp.P, shift)
+        return -cho_solve((factor, True), qp.q), exists
+
+    x, definite = minimise(qp, -tolerances.curvature)
+    proximal = lambda qp: minimise(qp, tolerances.proximal)  # noqa: E731
+    x, convex = only_if(~definite, proximal, (x, definite), qp)
+    return x, definite, convex
 
 
 def only_if(enabled: Array, function: Callable, otherwise: Any, operands: Any) -> Any:

@@ -68,8 +68,7 @@ def _jvp(config: QpConfig, primals: tuple, tangents: tuple) -> tuple[Solution, S
     column, row = normal.column, normal.row
     weight = ratio[0] + ratio[1]
     capped = weight >= tolerances.cap
-    eye = jnp.eye(len(solution.x), dtype=dtype)
-    factor = cholesky(plus_gram(normal.P + tolerances.proximal * eye, normal.A, weight))
+    factor = cholesky(plus_gram(normal.P, normal.A, weight, tolerances.proximal))
     solved = solution.status == Status.SOLVED
     shift = weight * d.rows - ratio[0] * d.u - ratio[1] * d.l
     pull, shift = jnp.where(solved, column * d.slope, 0.0), jnp.where(solved, row * shift, 0.0)

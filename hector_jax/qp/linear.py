@@ -28,17 +28,19 @@ def block_diagonal(blocks: Float[Array, "N r b"]) -> Float[Array, "m n"]:
     return wide.reshape(N * r, N * b)
 
 
-def plus_gram(P: Array, A: Array, w: Array) -> Array:
-    """Return P + A' diag(w) A."""
+def plus_gram(P: Array, A: Array, w: Array, shift: Array | float = 0.0) -> Array:
+    """Return P + A' diag(w) A + shift I."""
+    eye = shift * jnp.eye(A.shape[-1], dtype=P.dtype)
     if A.ndim == 2:
-        return P + (w[:, None] * A).T @ A
+        return P + ((w[:, None] * A).T @ A + eye)
     weighted = w.reshape(*A.shape[:2], 1) * A
-    return P + block_diagonal(contract("krb,krc->kbc", weighted, A))
+    return P + block_diagonal(contract("krb,krc->kbc", weighted, A) + eye)
 
 
 def cholesky(matrix: Array) -> Array:
     """Return the lower Cholesky factor of a symmetric matrix; NaN if not positive definite."""
-    return lax.linalg.cholesky(jnp.asarray(matrix), symmetrize_input=False)
+    # LAPACK reads columns: the transpose of rows, which needs no copy
+    return lax.linalg.cholesky(jnp.asarray(matrix).T, symmetrize_input=False)
 
 
 def largest(v: Array) -> Array:

@@ -192,11 +192,10 @@ def solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, Normal]:
     """Solve a QP. Returns the solution, W (2, m) of its derivative and the normalised problem."""
     tolerances = config.tolerances(qp.q.dtype)
     no_bound = jnp.isnan(qp.l) | jnp.isnan(qp.u) | (qp.l >= INFINITE) | (qp.u <= -INFINITE)
-    numbers = jnp.maximum(jnp.maximum(largest(qp.P), largest(qp.q)), largest(qp.A))
-    valid = jnp.isfinite(numbers) & ~jnp.any(no_bound)
-    # a trivial QP replaces an invalid one, so that no NaN reaches the solver
-    trivial = QP(jnp.eye(len(qp.q), dtype=qp.q.dtype), *(jnp.zeros_like(v) for v in qp[1:]))
-    normal = normalise(tolerances, where(valid, qp, trivial))
+    valid = jnp.all(jnp.isfinite(qp.q)) & jnp.all(jnp.isfinite(qp.A)) & ~jnp.any(no_bound)
+    # zeros replace invalid data, so that no NaN reaches the solver; a P with one is not convex
+    rest = where(valid, qp[1:], jax.tree.map(jnp.zeros_like, qp[1:]))
+    normal = normalise(tolerances, QP(qp.P, *rest))
     best, convex, unique = _decide(config, tolerances, normal, valid)
     valid &= convex
     # without a solution (infeasible, unbounded) residuals and x may be infinite
@@ -217,6 +216,7 @@ def solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, Normal]:
     y = normal.size * normal.row * multiplier(point.z)
     primal = jnp.maximum(primal, unmet)
     solution = Solution(x, y, primal, dual, gap, best.iterations, status)
+    normal = normal._replace(P=jnp.where(valid, normal.P, 0.0))
     return solution, _ratios(tolerances, normal, point), normal
 
 
