@@ -4,7 +4,6 @@ import os
 import sys
 import tempfile
 from contextlib import nullcontext
-from importlib.metadata import version
 from pathlib import Path
 
 # A test runs most programs once, so what it waits for is the compiler. Without optimisation it
@@ -14,8 +13,6 @@ from pathlib import Path
 _QUICK = []
 if not any(Path("/dev").glob("nvidia[0-9]*")):
     _QUICK.append("--xla_backend_optimization_level=0")
-if version("jaxlib").startswith("0.10."):
-    _QUICK.append("--xla_cpu_use_fusion_emitters=false")  # later ones do not know this flag
 os.environ["XLA_FLAGS"] = " ".join(_QUICK + os.environ.get("XLA_FLAGS", "").split())  # last wins
 # The matrices of the tests are small: threads of NumPy and SciPy would only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hector_jax.core import runtime
-from hector_jax.core.numerics import without_our_flag, without_ynnpack
+from hector_jax.core.numerics import add_flags, without_our_flags
 
 
 def test_importing_the_library_computes_nothing():
@@ -30,22 +30,25 @@ def test_a_worker_computes_in_64_bits_and_draws_what_its_parent_draws(monkeypatc
     np.testing.assert_array_equal(drawn, jax.random.PRNGKey(3))
 
 
+YNN, EMITTERS = "--xla_cpu_experimental_ynn_fusion_type=", "--xla_cpu_use_fusion_emitters=false"
+
+
 @pytest.mark.parametrize(
     ("before", "after"),
     [
-        ("", "FLAG="),
-        ("--xla_a=1 word", "FLAG= --xla_a=1 word"),
-        ("FLAG=dot --xla_a=1", "FLAG=dot --xla_a=1"),
+        ("", "YNN EMITTERS"),
+        ("--xla_a=1 word", "YNN EMITTERS --xla_a=1 word"),
+        ("YNNdot --xla_a=1", "EMITTERS YNNdot --xla_a=1"),
         ("flags.txt", "flags.txt"),
     ],
 )
 @pytest.mark.parametrize("version", [(0, 10, 1), (0, 10, 2), (0, 12, 0, 1), (0, 13, 0)])
-def test_ynnpack_is_turned_off_where_the_flag_is_known(monkeypatch, version, before, after):
-    flag = "--xla_cpu_experimental_ynn_fusion_type"
-    before, after = (text.replace("FLAG", flag) for text in (before, after))
-    assert without_our_flag(after) == before  # in the keys, the user's alone
+def test_flags_are_set_where_they_are_known(monkeypatch, version, before, after):
+    known = {"YNN": (0, 10, 2) <= version < (0, 13), "EMITTERS": version < (0, 11)}
+    after = " ".join(word for word in after.split() if known.get(word, True))
+    before, after = (t.replace("YNN", YNN).replace("EMITTERS", EMITTERS) for t in (before, after))
+    assert without_our_flags(after) == before  # in the keys, the user's alone
     monkeypatch.setattr("jaxlib.version.__version_info__", version)
     monkeypatch.setenv("XLA_FLAGS", before)
-    without_ynnpack()
-    known = (0, 10, 2) <= version < (0, 13)
-    assert os.environ["XLA_FLAGS"] == (after if known else before)
+    add_flags()
+    assert os.environ["XLA_FLAGS"] == after

@@ -17,7 +17,7 @@ from hector_jax.control.weights import expert
 from hector_jax.core.console import Broken, say
 from hector_jax.core.environment import environment
 from hector_jax.core.inputs import InputError, one_line
-from hector_jax.core.numerics import not_used, without_our_flag
+from hector_jax.core.numerics import not_used, without_our_flags
 from hector_jax.core.runtime import cache_folder
 from hector_jax.core.trajectory import SOLVED, Trajectory
 from hector_jax.report.motion import motions
@@ -110,7 +110,7 @@ def _variables() -> dict[str, str]:
     """Return what the environment sets of JAX and XLA, and what was done with it."""
     names = ("XLA_FLAGS", *(name.upper() for name in sorted(jax.config.values)))
     used = {name: os.environ[name] for name in names if os.environ.get(name)}
-    used["XLA_FLAGS"] = without_our_flag(used.get("XLA_FLAGS", ""))
+    used["XLA_FLAGS"] = without_our_flags(used.get("XLA_FLAGS", ""))
     return {name: f"{text} (used)" for name, text in used.items() if text} | {
         name: f"{text} (not used: {name.lower()} is {jax.config.values[name.lower()]})"
         for name, text in not_used().items()

@@ -15,7 +15,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from hector_jax.core.numerics import without_our_flag
+from hector_jax.core.numerics import without_our_flags
 
 # modules that do not affect numerical results
 _NO_NUMBERS = (
@@ -103,7 +103,7 @@ def code_hash(*modules: str) -> str:
         trees[name], imported, others = _syntax(_source(name).read_bytes())
         pending += imported
         packages |= others
-    flags = without_our_flag(os.environ.get("XLA_FLAGS", ""))
+    flags = without_our_flags(os.environ.get("XLA_FLAGS", ""))
     content = sorted(trees.items()), _installed(sorted(packages)), flags
     return hashlib.sha256(repr(content).encode()).hexdigest()[:12]
 

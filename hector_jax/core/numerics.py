@@ -46,14 +46,22 @@ _FREE = tuple(
         " jax_traceback jax_tracer_error jax_send_traceback jax_hlo_source"
     ).split()
 )
-_YNNPACK = "--xla_cpu_experimental_ynn_fusion_type"
+# XLA's flags on the CPU with the versions of jaxlib, from the first to before the second, that know
+# them: an unknown flag ends a process
+_FLAGS = {
+    # No YNNPACK: its sums read memory that nothing has written. With jaxlib 0.12 a third of the
+    # programs of the plain net gave NaN, and 0.10.2 has wrong sums (jax-ml/jax issue 39103).
+    "--xla_cpu_experimental_ynn_fusion_type=": ((0, 10, 2), (0, 13)),
+    # No MLIR for fused kernels: programs are as quick and compile in half the time.
+    "--xla_cpu_use_fusion_emitters=false": ((0, 10), (0, 11)),
+}
 
 
 def pin_options() -> None:
     """Give JAX's options the values that programs are made for; call before the first array."""
     import jax
 
-    without_ynnpack()
+    add_flags()
     values = (_defaults() if not_used() else {}) | PINNED
     for name in jax.config.values:  # which differ between versions
         if name in PINNED or name.upper() in not_used():
@@ -76,22 +84,25 @@ def _defaults() -> dict[str, Any]:
     return pickle.loads(subprocess.check_output([sys.executable, "-P", "-c", program]))
 
 
-def without_our_flag(flags: str) -> str:
+def without_our_flags(flags: str) -> str:
     """Return XLA_FLAGS as the user set them."""
-    return " ".join(word for word in flags.split() if word != f"{_YNNPACK}=")
+    return " ".join(word for word in flags.split() if word not in _FLAGS)
 
 
-def without_ynnpack() -> None:
-    """Turn off XLA's _YNNPACK on the CPU; call before JAX starts, which reads XLA_FLAGS once.
+def add_flags() -> None:
+    """Set our flags of XLA, but those that the user set; call before JAX starts, which reads them.
 
-    Its sums read memory that nothing has written: with jaxlib 0.12 a third of the programs of the
-    plain net gave NaN, and 0.10.2 has wrong sums (jax-ml/jax issue 39103). An unknown flag ends a
-    process, so only the versions that are known to know it are given it.
+    XLA reads XLA_FLAGS once.
     """
     from jaxlib.version import __version_info__ as version
 
     flags = os.environ.get("XLA_FLAGS", "")
-    in_file = flags.strip()[:1] not in ("", "-")  # XLA_FLAGS can name a file of flags
-    if (0, 10, 2) <= version < (0, 13) and _YNNPACK not in flags and not in_file:
-        # first, because XLA ignores what follows a word without a dash
-        os.environ["XLA_FLAGS"] = f"{_YNNPACK}= {flags}".strip()
+    if flags.strip()[:1] not in ("", "-"):
+        return  # it names a file of flags
+    ours = [
+        flag
+        for flag, (first, end) in _FLAGS.items()
+        if first <= version < end and flag.partition("=")[0] not in flags
+    ]
+    # first, because XLA ignores what follows a word without a dash
+    os.environ["XLA_FLAGS"] = " ".join([*ours, *flags.split()])
