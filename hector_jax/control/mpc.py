@@ -266,8 +266,7 @@ def half_hessian(
 ) -> Float[Array, "n n"]:
     """Return half of P. Source: Eq. 3."""
     _, G, turn, push, angles, later, travel, _, own = condensed
-    N, b = config.horizon, G.shape[-1]
-    weights = problem.parameters.weights
+    N, b, weights = config.horizon, G.shape[-1], problem.parameters.weights
     Q, R = weights.Q, input_weights(weights)
     effort = contract("kui,u,kuj->kij", G, R, G) + jax.vmap(jnp.diag)(_no_foot(config, condensed))
     wide = jnp.swapaxes(angles, 1, 2).reshape(3 * N, 3 * N)  # rows: step and angle
@@ -276,10 +275,9 @@ def half_hessian(
     turning += jnp.kron(overlap, jnp.diag(Q.ang_velocity))
     turned = contract("ixjy,jyb->ixjb", turning.reshape(N, 3, N, 3), turn)
     pushing = overlap[..., None] * Q.velocity + (travel.T @ travel)[..., None] * Q.position
-    pushed = contract("ijx,jxb->ixjb", pushing, push)
-    change, changed = jnp.concatenate([turn, push], 1), jnp.concatenate([turned, pushed], 1)
-    P = jnp.einsum("ixa,ixjb->iajb", change, changed).reshape(N * b, N * b)
-    P += block_diagonal(effort)
+    parts = (turn, push), (turned, contract("ijx,jxb->ixjb", pushing, push))
+    change, changed = (jnp.concatenate(part, axis=1) for part in parts)
+    P = jnp.einsum("ixa,ixjb->iajb", change, changed).reshape(N * b, -1) + block_diagonal(effort)
     if own is not None:
         A, _, weight = own
         P += A.T @ (weight[:, None] * A)

@@ -66,18 +66,23 @@ def _jvp(config: QpConfig, primals: tuple, tangents: tuple) -> tuple[Solution, S
     dtype = solution.x.dtype
     tolerances = config.tolerances(dtype)
     column, row = normal.column, normal.row
-    weight = ratio[0] + ratio[1]
+    weight = jnp.sum(ratio, axis=0)  # XLA repeats ratio[0] + ratio[1] in each use, a reduction not
     capped = weight >= tolerances.cap
-    factor = cholesky(plus_gram(normal.P, normal.A, weight, tolerances.proximal))
     solved = solution.status == Status.SOLVED
     shift = weight * d.rows - ratio[0] * d.u - ratio[1] * d.l
     pull, shift = jnp.where(solved, column * d.slope, 0.0), jnp.where(solved, row * shift, 0.0)
-    dv, dz = jnp.zeros_like(pull), jnp.zeros_like(shift)
-    for _ in range(2):  # as in `active_set`, the second pass removes the bias of cap and rho
-        force = jnp.where(capped, dz, 0.0) + weight * matvec(normal.A, dv) + shift
-        step = -cho_solve((factor, True), normal.P @ dv + pull + rmatvec(normal.A, force))
-        step = jnp.where(solved, step, 0.0)  # without a solution the factor can be NaN
-        dv, dz = dv + step, force + weight * matvec(normal.A, step)
+    factor = cholesky(plus_gram(normal.P, normal.A, weight, tolerances.proximal))
+
+    def step(pull: Array, force: Array) -> tuple[Array, Array]:
+        dv = -cho_solve((factor, True), pull + rmatvec(normal.A, force))
+        dv = jnp.where(solved, dv, 0.0)  # without a solution the factor can be NaN
+        return dv, force + weight * matvec(normal.A, dv)
+
+    dv, dz = step(pull, shift)
+    # as in `active_set`, a second pass removes the bias of cap and rho
+    force = jnp.where(capped, dz, 0.0) + weight * matvec(normal.A, dv) + shift
+    more, dz = step(normal.P @ dv + pull, force)
+    dv = dv + more
     zero = jnp.zeros((), dtype)
     none = np.zeros((), jax.dtypes.float0)
     return solution, Solution(column * dv, row * dz, zero, zero, zero, none, none)
