@@ -1,3 +1,4 @@
+# pyright: reportMissingImports=false
 """Worker processes of other machines: those of a scheduler of dask.distributed (extra `cluster`).
 
 A job is pure, so the scheduler gives that of a worker that ends to another one. Every worker, also
