@@ -331,15 +331,18 @@ def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
     return [stack([i.weights for i in history if i.accepted]) for history in histories]
 
 
-def _prepare_tuning(config: TuneConfig, robot: Robot, start: Weights, problem: Problem) -> None:
-    """Compile the programs of a tuning, so that its first call need not."""
+def _first_evaluation(config: TuneConfig, robot: Robot, start: Weights, problem: Problem) -> None:
+    """Evaluate the start of a tuning in one rollout, so that its first call need not compile."""
     scenario, *_ = rollouts_of(config, robot, problem)
-    weights = difftune.init(config, start).start
-    found = evaluate_jit(config.rollout, scenario, weights, config.loss, walk=rollout)
-    evaluation = jax.device_get(found)
+    evaluation = evaluation_job(config, scenario, difftune.init(config, start).start)
     if not problem.draws:
         difftune.check_start(StepStatus(int(step_status(config, evaluation))), evaluation)
-    matrix_job(config, scenario, weights)
+
+
+def _first_matrix(config: TuneConfig, robot: Robot, start: Weights, problem: Problem) -> None:
+    """Compute the matrix there, for the same reason."""
+    scenario, *_ = rollouts_of(config, robot, problem)
+    matrix_job(config, scenario, difftune.init(config, start).start)
 
 
 def compile_programs(
@@ -350,7 +353,7 @@ def compile_programs(
     others: Sequence[tuple[TuneConfig, Weights, Problem]] = (),
     meanwhile: Callable[[], None] = lambda: None,
 ) -> list[str]:
-    """Compile the programs of tunings, each in one process, and walk once in another one.
+    """Compile the programs of tunings, each in one process, and walk once in one of them.
 
     The other processes load these programs from the cache. The walk is with the weights at
     the start on the hfs; its faults that no weights can cure are returned, a line each.
@@ -369,9 +372,12 @@ def compile_programs(
     walking = pool.submit(
         not_the_weights, config.rollout.walk, jax.tree.map(np.asarray, robot), job
     )
-    preparing, plain = [], (config, start, Problem((trajectory.command,), None))
-    for settings, weights, problem in (plain, *others):
-        preparing.append(pool.submit(_prepare_tuning, settings, robot, weights, problem))
+    plain = config, start, Problem((trajectory.command,), None)
+    preparing = [
+        pool.submit(first, settings, robot, weights, problem)
+        for settings, weights, problem in (plain, *others)
+        for first in (_first_evaluation, _first_matrix)
+    ]
     meanwhile()
     with bar("compiling, once on a machine") as report_progress:
         report_progress(0, len(preparing), "")

@@ -105,7 +105,7 @@ def gradient_norms(
 
     def norm(name: str) -> float:
         single = tuple(term._replace(weight=float(term.name == name)) for term in loss)
-        evaluation = evaluate_jit(config, scenario, weights, single)
+        evaluation = evaluate_jit(config, scenario, weights, single, walk=rollout)
         logs = jax.tree.map(jnp.multiply, evaluation.gradient, weights)
         return float(jnp.linalg.norm(weights_to_vector(logs)))
 
