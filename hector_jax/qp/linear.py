@@ -1,6 +1,7 @@
 """Linear algebra of all methods; A is dense (m, n) or block-diagonal by step (N, r, b)."""
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Float
 
@@ -24,17 +25,17 @@ def rmatvec(A: Array, y: Array) -> Array:
 def block_diagonal(blocks: Float[Array, "N r b"]) -> Float[Array, "m n"]:
     """Return the matrix (N r, N b) with these blocks on its diagonal."""
     N, r, b = blocks.shape
-    wide = blocks[:, :, None, :] * jnp.eye(N, dtype=blocks.dtype)[:, None, :, None]
-    return wide.reshape(N * r, N * b)
+    inside = jnp.asarray(np.kron(np.eye(N), np.ones((r, b))), blocks.dtype)
+    return inside * jnp.tile(blocks.reshape(N * r, b), (1, N))
 
 
 def plus_gram(P: Array, A: Array, w: Array, shift: Array | float = 0.0) -> Array:
     """Return P + A' diag(w) A + shift I."""
-    eye = shift * jnp.eye(A.shape[-1], dtype=P.dtype)
+    P = P + shift * jnp.eye(len(P), dtype=P.dtype)
     if A.ndim == 2:
-        return P + ((w[:, None] * A).T @ A + eye)
+        return P + (w[:, None] * A).T @ A
     weighted = w.reshape(*A.shape[:2], 1) * A
-    return P + block_diagonal(contract("krb,krc->kbc", weighted, A) + eye)
+    return P + block_diagonal(contract("krb,krc->kbc", weighted, A))
 
 
 def cholesky(matrix: Array) -> Array:
