@@ -144,7 +144,7 @@ def test_from_the_command_to_the_qp_the_stack_has_14_frames(monkeypatch, tmp_pat
 
     monkeypatch.setattr(mpc, "solve_qp", solve_qp)
     monkeypatch.setattr(tunings, "not_the_weights", slice)  # any function of three
-    monkeypatch.setattr(tune, "workers", lambda _: nullcontext(HandsOver()))
+    monkeypatch.setattr(tune, "workers", lambda *_: nullcontext(HandsOver()))
     trajectory, start = tmp_path / "brief.toml", tmp_path / "start.json"
     trajectory.write_text('name = "brief"\n[[segment]]\nseconds = 0.15\nv_x = 0.2\n')
     save_weights(start, nominal())
