@@ -334,7 +334,8 @@ def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
 def _first_evaluation(config: TuneConfig, robot: Robot, start: Weights, problem: Problem) -> None:
     """Evaluate the start of a tuning in one rollout, so that its first call need not compile."""
     scenario, *_ = rollouts_of(config, robot, problem)
-    evaluation = evaluation_job(config, scenario, difftune.init(config, start).start)
+    inputs = config.rollout, scenario, difftune.init(config, start).start, config.loss
+    evaluation = jax.device_get(evaluate_jit(*inputs, walk=rollout))
     if not problem.draws:
         difftune.check_start(StepStatus(int(step_status(config, evaluation))), evaluation)
 
@@ -372,12 +373,10 @@ def compile_programs(
     walking = pool.submit(
         not_the_weights, config.rollout.walk, jax.tree.map(np.asarray, robot), job
     )
-    plain = config, start, Problem((trajectory.command,), None)
-    preparing = [
-        pool.submit(first, settings, robot, weights, problem)
-        for settings, weights, problem in (plain, *others)
-        for first in (_first_evaluation, _first_matrix)
-    ]
+    preparing, plain = [], (config, start, Problem((trajectory.command,), None))
+    for settings, weights, problem in (plain, *others):
+        for first in (_first_evaluation, _first_matrix):
+            preparing.append(pool.submit(first, settings, robot, weights, problem))
     meanwhile()
     with bar("compiling, once on a machine") as report_progress:
         report_progress(0, len(preparing), "")
