@@ -441,10 +441,10 @@ def test_units_redundant_rows_and_rounding_change_no_verdict():
             cases += [in_units(more, variable=each_variable)]
             cases += [in_units(more, 1e4, each_row, each_variable)]
             expected += [status] * 17
-        for bound in (0.0, 1e-17, 1e-9, -1e-9, -1e-5):
+        for bound in (0.0, 1e-17, 1e-9, -1e-9, -1e-6):
             cases += [with_rows(qp, 0.0, never[0], [bound, INF, INF])]
             cases += [with_rows(qp, 0.0, [-INF, -bound, -INF], never[1])]
-            unmet = bound == -1e-5 and status != Status.BAD_DATA
+            unmet = bound == -1e-6 and status != Status.BAD_DATA
             expected += [Status.INFEASIBLE if unmet else status] * 2
     found = solve_all(cases).status  # of SHAPES[2]
     wrong = [

@@ -203,8 +203,8 @@ def solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, Normal]:
     point = jax.tree.map(lambda v: jnp.where(usable, v, 0.0), best.point)
 
     solved = usable & (jnp.max(best.residuals) <= tolerances.residual)
-    # the unavoidable violation; an x that is not a solution does not scale it
-    sizes = jnp.min(normal.row_sizes(jnp.where(solved, point.x, normal.reach)), axis=0)
+    # the unavoidable violation; an x that is no solution, or one of many, does not scale it
+    sizes = jnp.min(normal.row_sizes(jnp.where(solved & unique, point.x, normal.reach)), axis=0)
     unmet = jnp.max(normal.unmet / sizes, initial=0.0)
     status = jnp.where(best.certified[1], Status.UNBOUNDED, Status.INACCURATE)
     status = jnp.where(best.certified[0], Status.INFEASIBLE, status)
