@@ -277,7 +277,7 @@ def half_hessian(
     pushing = overlap[..., None] * Q.velocity + (travel.T @ travel)[..., None] * Q.position
     parts = (turn, push), (turned, contract("ijx,jxb->ixjb", pushing, push))
     change, changed = (jnp.concatenate(part, axis=1) for part in parts)
-    P = jnp.einsum("ixa,ixjb->iajb", change, changed).reshape(N * b, -1) + block_diagonal(effort)
+    P = contract("ixa,ixjb->iajb", change, changed).reshape(N * b, -1) + block_diagonal(effort)
     if own is not None:
         A, _, weight = own
         P += A.T @ (weight[:, None] * A)
