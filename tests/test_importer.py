@@ -12,6 +12,7 @@ from pretend import call
 from published import JOINTS, small
 
 from hector_jax.control.controller import walk_config
+from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import as_toml
 from hector_jax.importing.propose import HEIGHT, MASS, propose_robot
 from hector_jax.importing.remarks import remarks
@@ -19,7 +20,7 @@ from hector_jax.importing.soles import find_soles
 from hector_jax.importing.survey import survey_file
 from hector_jax.importing.table import table_of
 from hector_jax.robot.checks import standing_data
-from hector_jax.robot.description import Description, description_of, read_description
+from hector_jax.robot.description import MODEL_PATH, Description, description_of, read_description
 from hector_jax.robot.model import compile_model, load_robot, robot_of
 from hector_jax.robot.response import response, swing_frequency
 from hector_jax.robot.source import build_spec
@@ -128,6 +129,11 @@ def test_a_robot_that_cannot_be_used_is_refused_with_the_reason(tmp_path, case):
     proposal = propose_robot(edited(tmp_path, *changes))
     assert re.search(text, proposal.error)
     assert proposal.error in proposal.wrong
+
+
+def test_a_file_for_another_robot_names_the_command(tmp_path):
+    with pytest.raises(InputError, match=r"no joint 'left_hip_yaw'.*: hector robot .*robot.xml"):
+        load_robot(edited(tmp_path))
 
 
 KNEE, PITCH = 'right_knee" axis="0 1 0" range="-0.1 ', 'right_pitch" axis="0 1 0'
@@ -363,6 +369,19 @@ def test_gains_follow_from_what_hangs_at_a_joint_and_sizes_scale_with_mass_and_h
     assert dict(description.loss) == {"L_ctrl": pytest.approx(1 / m**2, rel=6e-3)}
     assert description.plants.joint_friction == pytest.approx(m * h, rel=6e-3)
     assert description.plants.push == description.plants.payload == pytest.approx(m, rel=6e-3)
+
+
+def test_the_command_prints_the_table_and_the_proposal(monkeypatch, capsys):
+    assert call(monkeypatch, "robot", MODEL_PATH) == 0
+    out = capsys.readouterr().out
+    table, text = out.split("\n\n", 1)
+    assert table.startswith("robot    hector: 12 kg, trunk 'trunk'")
+    assert "knees bend backwards" in table
+    assert re.search(r"left_hip_yaw, right_hip_yaw +\+z yaw", table)
+    assert "feet     line: " in table
+    assert "mended   " in table
+    assert "wrong    nothing" in table
+    assert tomllib.loads(text)["joints"]["left"][0] == "left_hip_yaw"
 
 
 def test_a_proposal_is_written_once_and_beside_its_model(monkeypatch, capsys, tmp_path):

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from pretend import elsewhere, pretend_history, pretend_walk
 
 from hector_jax.core.trajectory import State
 from hector_jax.report import plots
+from hector_jax.report.plots.style import SETS, looks_of
 from hector_jax.tuning.loss import PAPER_LOSS
 
 FOUR = ("nominal", "expert", "without", "with")
@@ -56,6 +58,14 @@ def test_lines_end_at_a_fall(tmp_path, drawn, walks):
     for axes in [*drawn[0].axes, *drawn[1].axes]:
         up = np.isfinite(lines(axes)["without (tuned, no net)"][:, 1])
         assert up.tolist() == [True] * 60 + [False] * 40
+
+
+def test_sets_are_not_drawn_alike_and_stay_apart_in_grey():
+    every = looks_of([*SETS, *(f"mine {i}" for i in range(5))])
+    assert len({look.color for look in every.values()}) == len(every)
+    names = ("with", "expert", "without", "nominal")  # from dark to light
+    greys = [np.dot(to_rgb(every[name].color), (0.299, 0.587, 0.114)) for name in names]
+    assert np.diff(greys).min() > 0.12
 
 
 def test_the_loss_by_iteration_shows_refused_steps_that_are_no_numbers(tmp_path, drawn):

@@ -1,6 +1,9 @@
-"""Load: nothing is compiled twice, and nothing grows with the iterations."""
+"""Load: nothing is compiled twice, and nothing grows with the iterations or beyond 6 GiB."""
 
+import json
 import os
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -17,6 +20,7 @@ from hector_jax.robot.model import load_robot
 from hector_jax.tuning.difftune import TuneConfig, tune
 from hector_jax.tuning.rollout import RolloutConfig, Scenario
 
+ROOT = Path(__file__).parents[1]
 ROBOT = load_robot()
 ANCHOR = standing_anchor(ROBOT)
 
@@ -74,3 +78,18 @@ def test_memory_arrays_and_open_files_stay_flat_over_500_iterations():
     assert len(found.iterations) == 501
     assert pages[1] <= 1.05 * pages[0]
     assert counts[1] == counts[0]
+
+
+@pytest.mark.slow
+def test_256_closed_loops_at_once_stay_under_6_gib():
+    """With their gradients, in a process of its own."""
+    ran = subprocess.run(
+        [sys.executable, "-m", "benchmarks.closed_loop", "--ticks=400", "--batch=256"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert ran.returncode == 0, ran.stderr
+    told = json.loads(ran.stdout.splitlines()[-1])
+    assert told["memory"] < 6 * 2**30
+    assert told["finite"] == 1.0

@@ -10,6 +10,7 @@ from PIL import Image
 from pretend import instead, pretend_walk
 from scipy.spatial.transform import Rotation
 
+from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State
 from hector_jax.report import video
 from hector_jax.report.motion import motion, motions, poses
@@ -105,3 +106,10 @@ def test_back_ends_are_tried_in_turn_and_without_any_there_is_one_line(
         write_film(film, robot, walks)
     assert "\n" not in str(told.value)
     assert not list(tmp_path.iterdir())
+
+
+def test_what_cannot_be_filmed_is_refused(robot, tmp_path):
+    with pytest.raises(ValueError, match="two walks side by side, got 1"):
+        write_film(tmp_path / "film.mp4", robot, {"a": motion(robot, pretend_walk(seconds=0.1))})
+    with pytest.raises(InputError, match=r"must end in .mp4, .webp, .gif, .png, got film.avi"):
+        video.check_film(tmp_path / "film.avi")

@@ -138,7 +138,7 @@ def between(first: Weights, second: Weights, share: float = 0.5) -> Weights:
     """
     if first.others.keys() != second.others.keys():
         names = (", ".join(x.others) or "none" for x in (first, second))
-        raise InputError(f"weights to mix have other numbers beside Q and R: {' and '.join(names)}")
+        raise InputError(f"weights to mix differ in numbers beside Q and R: {' and '.join(names)}")
     Q, R = jax.tree.map(lambda x, y: x ** (1.0 - share) * y**share, first[:2], second[:2])
     others = jax.tree.map(lambda x, y: (1.0 - share) * x + share * y, first.others, second.others)
     return jax.tree.map(np.asarray, Weights(Q, R, others))
