@@ -30,6 +30,11 @@ def test_a_worker_computes_in_64_bits_and_draws_what_its_parent_draws(monkeypatc
     np.testing.assert_array_equal(drawn, jax.random.PRNGKey(3))
 
 
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no binding to cores")
+def test_workers_share_out_the_cores():
+    assert [runtime._claim_core([-1, -2]) for _ in range(4)] == [-1, -2, -1, -2]
+
+
 YNN, EMITTERS = "--xla_cpu_experimental_ynn_fusion_type=", "--xla_cpu_use_fusion_emitters=false"
 
 

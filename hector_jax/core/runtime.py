@@ -11,10 +11,11 @@ import socket
 import tempfile
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
+from itertools import product
 from multiprocessing import active_children, parent_process
 from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
@@ -119,28 +120,29 @@ def _leave_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _claim(core: int) -> bool:
-    """Whether no other worker process of this machine has the core; now this one has it."""
-    name = socket.socket(socket.AF_UNIX)
-    try:
-        name.bind(f"\0hector_jax core {core}")  # no file: the name is free when the process ends
-    except OSError:
-        return False
-    name.detach()
-    return True
+def _claim_core(cores: Sequence[int]) -> int:
+    """Return the core that the fewest worker processes of this machine have; now this one has it.
+
+    A claim is a name of a socket. It is no file: the name is free when the process ends.
+    """
+    for turn, core in product(range(64), cores):
+        with socket.socket(socket.AF_UNIX) as claim, suppress(OSError):
+            claim.bind(f"\0hector_jax core {core}, {turn}")
+            claim.detach()
+            return core
+    return cores[0]
 
 
 def start_worker(bind: bool) -> None:
     """Set up a worker process like its parent, which alone handles interrupts and accelerators.
 
     Args:
-        bind: bind the process to a core, a free one if there is one. Otherwise the XLA threads of
-            several workers would wait for each other, which takes several times as long.
+        bind: bind the process to a core. Otherwise the XLA threads of several workers would wait
+            for each other, which takes several times as long.
     """
     _leave_with_parent()
     if bind and hasattr(os, "sched_setaffinity"):
-        cores = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, {next(filter(_claim, cores), cores[os.getpid() % len(cores)])})
+        os.sched_setaffinity(0, {_claim_core(sorted(os.sched_getaffinity(0)))})
     # MuJoCo's about a robot's file, which the parent has read too
     warnings.filterwarnings("ignore", category=UserWarning, module="hector_jax")
     import jax
