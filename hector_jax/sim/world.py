@@ -301,9 +301,9 @@ def _model(description: Description, slack: bool, sensors: bool) -> mujoco.MjMod
     return spec.compile()
 
 
-@lru_cache(maxsize=8)  # a walk takes less than twenty times as long as this
-def _compile(description: Description, slack: bool, sensors: bool, text: str) -> World:
-    """Compile the model of a description; `text` is that of its file, which may change."""
+@lru_cache(maxsize=8)  # it takes a twentieth of a walk of some seconds
+def _compile(description: Description, slack: bool, sensors: bool, content: str) -> World:
+    """Compile the model of a description; `content` is that of its file, which may change."""
     model, names = _model(description, slack, sensors), description.joints
     floors = [g for g in range(model.ngeom) if model.geom_bodyid[g] == 0 and model.geom_contype[g]]
     text = f"expected one floor that collides, got {len(floors)}"
@@ -366,9 +366,9 @@ def build_worlds(
     for plant in imperfections:
         _check(plant)
     description = description or HECTOR
-    text = read_text(description.model, "the robot description", MOST_BYTES)
+    content = read_text(description.model, "the robot description", MOST_BYTES)
     slack = [bool(plant.backlash > 0.0) for plant in imperfections]
-    worlds = (_compile(description, value, sensors, text) for value in slack)
+    worlds = (_compile(description, value, sensors, content) for value in slack)
     return [_with_numbers(w, p) for w, p in zip(worlds, imperfections, strict=True)]
 
 

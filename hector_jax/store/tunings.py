@@ -341,7 +341,7 @@ def _first_evaluation(config: TuneConfig, robot: Robot, start: Weights, problem:
 
 
 def _first_matrix(config: TuneConfig, robot: Robot, start: Weights, problem: Problem) -> None:
-    """Compute the matrix there, for the same reason."""
+    """Compute the matrix of the start in one rollout, so that its first need not compile."""
     scenario, *_ = rollouts_of(config, robot, problem)
     matrix_job(config, scenario, difftune.init(config, start).start)
 
