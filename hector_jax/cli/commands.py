@@ -9,6 +9,7 @@ from typing import Any
 from hector_jax.cli import arguments, doctor, evaluate, flags, propose, tune, verdict, view, walker
 from hector_jax.cli.arguments import print_result
 from hector_jax.control.controller import walk_config
+from hector_jax.control.twin import TwinConfig
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.console import say
@@ -171,8 +172,10 @@ def run_robot(args: flags.Robot) -> None:
         if proposal.error is None:
             try:
                 loss_of_robot(robot.description)
-                delay = margin.delay_lines(robot, walk_config(robot), nominal(robot))
-                lines += section("delay", delay)
+                config = walk_config(robot)
+                if config.twin == TwinConfig():  # else its legs are another program's
+                    delay = margin.delay_lines(robot, config, nominal(robot))
+                    lines += section("delay", delay)
             except InputError as error:  # a setting that controller or loss refuse
                 wrong.append(str(error))
         lines += section("mended", changes_of_model(robot))
