@@ -103,6 +103,16 @@ def test_a_model_that_repeats_itself_gives_way_to_the_surrogate_nearby():
     assert not needs_model([*history, walked(proposal, 0.1)])
 
 
+def test_where_walks_never_repeat_the_region_is_about_the_last_good_one_and_grows():
+    """One walk that gains less than predicted, by its noise, does not shrink it."""
+    far = SPACE.to_point @ np.array([-2.0, 2.0, -2.0, 2.0, 0.0])
+    start, good = np.zeros(SIZE), np.full(SIZE, 0.1)
+    history = [WalkResult(start, "start", None, 0.0, 0.1)]
+    history += [WalkResult(good, "model", -0.5, -0.02, 0), WalkResult(-good, "model", -0.6, 0.1, 0)]
+    proposal = propose(SPACE, history, model_of(SPACE.to_steps @ far)._replace(every_walk=True))
+    assert np.linalg.norm(proposal.point - good) == pytest.approx(2.0, rel=0.02)
+
+
 def test_proposals_stay_in_the_box():
     narrow = SPACE._replace(box=np.tile([-0.1, 0.1], (SIZE, 1)))
     history = []

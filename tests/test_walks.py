@@ -23,6 +23,7 @@ from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import loss_of
 from hector_jax.walk_tuning import campaign as campaigns
 from hector_jax.walk_tuning import reported_walks, walk_log, walks
+from hector_jax.walk_tuning.grounded_model import replayed
 
 # all walks of this file are of these ticks and this command: one set of programs for all tests
 CONFIG, COMMAND, SECONDS = TuneConfig(rollout=BRIEF), {"short": AHEAD}, 0.05
@@ -99,6 +100,14 @@ def test_what_was_walked_is_not_walked_again(monkeypatch, pool, in_process):
     again = walks.tune_on_walks(pool, one, WALKS)
     weights_again, _ = walks.answer(one, walks.campaign_space(pool, one), again)
     np.testing.assert_array_equal(weights_again.Q.euler, weights.Q.euler)
+
+
+def test_a_model_of_every_walk_proposes_after_each(robot, pool, tmp_path):
+    one = replace(campaign(tmp_path, robot, [hfs()]), model="every_walk")
+    rows = walks.tune_on_walks(pool, one, 3)
+    assert [row.method for row in rows] == ["start", "model", "model"]
+    assert rows[1].losses[0] < 0.95 * rows[0].losses[0]
+    assert max(row.predicted for row in rows[1:]) < 0.0
 
 
 def test_any_engine_walks_and_is_recorded(robot, in_process, tmp_path):
@@ -192,3 +201,12 @@ def test_the_sets_to_choose_from_are_the_start_each_gain_and_the_answer(pool, in
     assert gains < set(numbers)
     assert len(set(numbers) - gains) <= 2  # the start and the answer
     assert any(np.array_equal(each.Q.euler, weights.Q.euler) for each in sets.values())
+
+
+def test_a_replay_keeps_the_mean_over_the_gait_cycle_and_takes_the_deviations_of_another():
+    own, other = np.random.default_rng(0).standard_normal((2, 4, 50, 3))  # cycle, phase
+    [replay] = replayed([own.reshape(200, 3)], [other.reshape(200, 3)], cycle=50)
+    replay = replay.reshape(own.shape)
+    np.testing.assert_allclose(replay.mean(0), own.mean(0), atol=1e-12)
+    deviations = np.roll(other - other.mean(0), 2, axis=0)  # half a walk later
+    np.testing.assert_allclose(replay - replay.mean(0), deviations, atol=1e-12)

@@ -213,8 +213,8 @@ class Propose(ForRobot, Parallel, Printed):
     folder: Folder  # of this tuning; a later call needs no other flag
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
     start: Weights = "best"  # weights of the first walk: nominal, expert, best or a weights file
-    # weights: Q and R; also footsteps, integral, all, legs, or numbers by name
-    tune: tuple[Tunables, ...] = ("weights",)
+    tune: tuple[Tunables, ...] = ("weights",)  # weights, footsteps, integral, all, legs or names
+    every_walk: bool = False  # correct the model by all walks, for plants or noise that differ
     seed: Seed = 0  # of the random numbers
 
 

@@ -179,4 +179,5 @@ def _campaign(args: Propose) -> Campaign:
         commands,
         seed=args.seed,
         leg_numbers=leg_numbers(args.tune),
+        model="every_walk" if args.every_walk else "grounded",
     )

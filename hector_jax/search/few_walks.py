@@ -6,7 +6,9 @@ of two methods:
 
 - `model`: the least loss, in a trust region about the best walk, of the rigid-body model grounded
   on that walk (tuning/grounded.py), until two walks in a row gain less than 1 %. If its point was
-  walked already, the surrogate takes over.
+  walked already, the surrogate takes over. A model can also be grounded on all walks, where they
+  never repeat: one tells little of a gain, so the region is about the last that was no worse than
+  the start, and grows with each of these.
 - `surrogate`: the largest expected improvement, in the trust region, by a Gaussian process on the
   log-losses of all walks, times the probability of a margin against falls. It learns what the model
   does not contain.
@@ -38,7 +40,7 @@ _FIRST, _LEAST, _MOST = 1.0, 0.3, 4.0  # radius of the trust region
 GAIN = 0.01
 """Smallest significant gain in log-loss."""
 _STALLED = 2  # walks of the model in a row without such a gain before the surrogate takes over
-_STEPS = 2  # on the model for a proposal
+_STEPS, _MANY_STEPS = 2, 5  # for a proposal on the model of one walk, and of all
 _SAME = 0.02  # the model's point counts as walked within this distance of a walk
 _STARTS, _SQP = 6, 40  # of the maximisation of the expected improvement: starts, iterations
 _ROWS = 16  # histories are padded to multiples of this, so that few programs are compiled
@@ -100,6 +102,7 @@ class Model(NamedTuple):
     # loss relative to the start, infinite if the model falls, and its gradient
     evaluate: Callable[[Float[np.ndarray, " n"]], tuple[float, Float[np.ndarray, " n"]]]
     matrix: Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, "n n"]]  # Gauss-Newton matrix
+    every_walk: bool = False  # grounded on all walks, not on the best
 
 
 class _Region(NamedTuple):
@@ -174,8 +177,11 @@ def propose(
         return Proposal(np.zeros(len(space.box)), "start", None)
     region = _region(history)
     if model is not None and needs_model(history):
-        center = history[region.center].point
-        point, predicted = _descend_in(space, center, region.radius, model)
+        center, radius = region.center, region.radius
+        if model.every_walk:
+            no_worse = [i for i, row in enumerate(history) if row.loss <= history[0].loss]
+            center, radius = no_worse[-1], min(_FIRST * len(no_worse), _MOST)
+        point, predicted = _descend_in(space, history[center].point, radius, model)
         if min(np.linalg.norm(point - row.point) for row in history) > _SAME:
             return Proposal(point, "model", float(predicted))
         region = region._replace(radius=_FIRST)
@@ -188,10 +194,10 @@ def _descend_in(
     """Take Gauss-Newton steps on the model in a ball and the box; returns point and log-loss."""
     rule = step_rules.trust_region(ridge=0.0)
     state = cast(StepState, rule.init(jnp.zeros(len(center))))._replace(size=jnp.asarray(radius))
-    point = center
-    for step in range(_STEPS + 1):
+    point, steps = center, _MANY_STEPS if model.every_walk else _STEPS
+    for step in range(steps + 1):
         loss, gradient = model.evaluate(point)
-        used = step < _STEPS and loss < state.value  # else the rule leaves the point again
+        used = step < steps and loss < state.value  # else the rule leaves the point again
         matrix = model.matrix(point) if used else np.zeros((len(point), len(point)))
         given = {"value": jnp.asarray(loss), "matrix": jnp.asarray(matrix)}
         away = jnp.asarray(point - center)

@@ -41,11 +41,12 @@ class Campaign:
     seed: int = 0
     leg_numbers: tuple[str, ...] = ()  # of the legs, which the model does not have
     engine: Engine = MUJOCO_C
-    # that proposes: "grounded", corrected by the residuals of the best walk, "plain", or "none"
+    # that proposes: "grounded", corrected by the residuals of the best walk, "every_walk", by those
+    # of all, "plain", or "none"
     model: str = "grounded"
 
     def __post_init__(self) -> None:
-        choose("Campaign.model", self.model, ("grounded", "plain", "none"))
+        choose("Campaign.model", self.model, ("grounded", "every_walk", "plain", "none"))
         start = jax.tree.map(np.asarray, init(self.config, self.start).start)
         start = with_leg_numbers(self.config.rollout.walk, start, self.leg_numbers)
         object.__setattr__(self, "start", start)

@@ -13,19 +13,17 @@ A weight set is walked in each case: all commands, on each plant. Its loss is th
 cases, each divided by its loss at the start, so that all count alike.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from itertools import repeat
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from hector_jax.control.parameters import steps_between
-from hector_jax.control.reference import Command, standing_anchor
 from hector_jax.control.weights import Weights, direction_names
 from hector_jax.control.weights_file import save_weights, weights_tree
 from hector_jax.core.console import bar, say
@@ -34,32 +32,20 @@ from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.journal import add_row, continue_journal
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
-from hector_jax.grfm import network
 from hector_jax.search import few_walks
 from hector_jax.search.few_walks import Model, Proposal, Space, WalkResult
 from hector_jax.sim.loop import Job
 from hector_jax.store import tunings
 from hector_jax.store.cache import content_key, robot_hash
 from hector_jax.store.setup import Setup
-from hector_jax.tuning.difftune import step_status
-from hector_jax.tuning.grounded import Grounding, fit_grounding, grounded_rollout
-from hector_jax.tuning.rollout import Scenario
-from hector_jax.tuning.status import StepStatus
-from hector_jax.walk_tuning.campaign import (
-    Campaign,
-    box_of,
-    matrix_of,
-    slope_of,
-    walker_hash,
-    weights_at,
-)
+from hector_jax.walk_tuning import grounded_model
+from hector_jax.walk_tuning.campaign import Campaign, box_of, walker_hash, weights_at
 from hector_jax.walk_tuning.walk_log import (
     Log,
     ScoredLog,
     evaluate_log,
     log_of,
     read_log,
-    trajectory_of,
 )
 
 RECORD = "walks.jsonl"
@@ -87,18 +73,6 @@ def walk_case(campaign: Campaign, weights: Weights, case: int) -> ScoredLog:
     walked = next(campaign.engine.walk(None, config.rollout.walk, robot, [job]))
     log = jax.tree.map(np.asarray, log_of(walked))
     return evaluate_log(config, robot, command, log)
-
-
-def _ground_job(campaign: Campaign, weights: Weights, command: Command, log: Log) -> Grounding:
-    """Ground the plain rigid body on a walk, unless the campaign has no use for residuals."""
-    config, robot = campaign.config.rollout, campaign.robot
-    effect = network.effect_of(None, config.walk)
-    trajectory = trajectory_of(log)
-    scenario = Scenario(robot, command, standing_anchor(robot), effect)
-    grounding = fit_grounding(config, scenario, weights, trajectory)
-    if campaign.model == "plain":
-        grounding = grounding._replace(residuals=jax.tree.map(jnp.zeros_like, grounding.residuals))
-    return jax.device_get(grounding)
 
 
 def row_of(proposal: Proposal, cases: Sequence[ScoredLog]) -> Row:
@@ -246,38 +220,13 @@ def _plan_logs(pool: Executor, campaign: Campaign, number: int) -> list[Log]:
 
 
 def _model(pool: Executor, campaign: Campaign, space: Space, rows: Sequence[Row]) -> Model:
-    """Return the model grounded on the best walk, where its loss is that of the walk."""
-    best = few_walks.best_walk(_walked(rows))
-    weights = weights_at(campaign, space, rows[best].point)
-    commands = [command for _, command in campaign.cases]
-    logs = _plan_logs(pool, campaign, best)
-    groundings = list(pool.map(_ground_job, repeat(campaign), repeat(weights), commands, logs))
-
-    def of_cases(job: Callable[..., Any], weights: Weights) -> list[Any]:
-        running = [
-            pool.submit(job, campaign.config, grounding, weights, grounded_rollout)
-            for grounding in groundings
-        ]
-        return [job.result() for job in running]
-
-    at_best = of_cases(tunings.evaluation_job, weights)
-    model_losses = np.array([case.loss for case in at_best])
-    scales = rows[best].losses / rows[0].losses / model_losses / len(commands)
-
-    def evaluate(point: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
-        weights = weights_at(campaign, space, point)
-        walked = np.array_equal(point, rows[best].point)
-        cases = at_best if walked else of_cases(tunings.evaluation_job, weights)
-        if any(step_status(campaign.config, case) != StepStatus.ACCEPTED for case in cases):
-            return np.inf, np.zeros_like(point)
-        slopes = [slope_of(campaign, space, weights, case.gradient) for case in cases]
-        return float(scales @ [float(case.loss) for case in cases]), scales @ np.array(slopes)
-
-    def matrix(point: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n n"]:
-        matrices = of_cases(tunings.matrix_job, weights_at(campaign, space, point))
-        return matrix_of(campaign, space, np.tensordot(scales, matrices, axes=1))
-
-    return Model(evaluate, matrix)
+    """Return the model grounded on the best walk, or on all: see `Campaign.model`."""
+    numbers = [few_walks.best_walk(_walked(rows))]
+    if campaign.model == "every_walk":
+        numbers = [number for number, row in enumerate(rows) if _stood(row)]
+    walked = [(rows[number].point, _plan_logs(pool, campaign, number)) for number in numbers]
+    ratios = rows[numbers[0]].losses / rows[0].losses
+    return grounded_model.model_of(pool, campaign, space, walked, ratios)
 
 
 def add_walk(
