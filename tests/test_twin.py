@@ -206,3 +206,10 @@ def test_a_twin_file_is_read_as_a_robots():
     assert config.twin == TwinConfig(FROM_ROBOT, linearisation=FROZEN, contact_at=0.0, plan_ticks=2)
     assert config.plan_interval == pytest.approx(0.01)
     assert rollout_config(load_robot(OWN / "twin.toml")).ticks == 800  # 4 s
+
+
+def test_nothing_is_said_of_the_motors_of_a_twin_whose_legs_are_anothers(monkeypatch, capsys):
+    assert call(monkeypatch, "robot", OWN / "twin.toml") == 0
+    lines = capsys.readouterr().out
+    assert "own_controller: 12 kg" in lines
+    assert "of the motors" not in lines
