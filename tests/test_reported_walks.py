@@ -229,6 +229,13 @@ def rows(folder):
     return reported_walks.read_reports(HandsOver(), campaign(folder))
 
 
+def test_later_calls_ground_the_model_on_every_walk_if_the_first_asks_for_it(folder):
+    flags = {"traj": ("ahead.toml",), "start": "nominal", "tune": ("foot_height",)}
+    propose.run_propose(Propose(folder, every_walk=True, **flags))
+    next_walk(folder)
+    assert campaign(folder).model == "every_walk"
+
+
 @pytest.mark.parametrize("undo", [True, False])
 def test_a_report_or_undo_that_is_killed_leaves_the_old_or_the_new_state(folder, undo):
     """Killed before and after each of its writes; then the same once more."""

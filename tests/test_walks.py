@@ -102,12 +102,20 @@ def test_what_was_walked_is_not_walked_again(monkeypatch, pool, in_process):
     np.testing.assert_array_equal(weights_again.Q.euler, weights.Q.euler)
 
 
-def test_a_model_of_every_walk_proposes_after_each(robot, pool, tmp_path):
+def test_a_model_of_every_walk_is_grounded_on_each(monkeypatch, robot, pool, tmp_path):
+    seen, model_of = [], walks.grounded_model.model_of
+
+    def watched(*inputs):
+        seen.append(len(inputs[3]))
+        return model_of(*inputs)
+
+    monkeypatch.setattr(walks.grounded_model, "model_of", watched)
     one = replace(campaign(tmp_path, robot, [hfs()]), model="every_walk")
     rows = walks.tune_on_walks(pool, one, 3)
     assert [row.method for row in rows] == ["start", "model", "model"]
     assert rows[1].losses[0] < 0.95 * rows[0].losses[0]
     assert max(row.predicted for row in rows[1:]) < 0.0
+    assert seen == [1, 2]
 
 
 def test_any_engine_walks_and_is_recorded(robot, in_process, tmp_path):

@@ -213,8 +213,9 @@ class Propose(ForRobot, Parallel, Printed):
     folder: Folder  # of this tuning; a later call needs no other flag
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
     start: Weights = "best"  # weights of the first walk: nominal, expert, best or a weights file
-    tune: tuple[Tunables, ...] = ("weights",)  # weights, footsteps, integral, all, legs or names
-    every_walk: bool = False  # correct the model by all walks, for plants or noise that differ
+    # weights: Q and R; also footsteps, integral, all, legs, or numbers by name
+    tune: tuple[Tunables, ...] = ("weights",)
+    every_walk: bool = False  # correct the model by all walks, not the best: where none is repeated
     seed: Seed = 0  # of the random numbers
 
 
@@ -363,8 +364,7 @@ class Export(Printed):
     out: Path | None = None  # folder; by default `export` in the run or beside the weights file
     traj: Annotated[str | None, PathKind.TRAJECTORY] = None  # of the check; by default the run's
     seconds: Seconds = 1.0  # length of that walk after the start-up [s]
-    # TOML file of the robot of a weights file, and with --template of any; HECTOR by default
-    robot: RobotFile = None
+    robot: RobotFile = None  # TOML file, with a weights file or --template; HECTOR by default
     # write no controller, but fill this file of numbers of another one: {{ Q.euler[0] }}, ..
     template: Annotated[Path | None, PathKind.FILE] = None
 

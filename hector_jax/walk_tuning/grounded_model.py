@@ -32,8 +32,8 @@ def model_of(
 ) -> Model:
     """Return the mean loss of the rigid body grounded on walks, relative to the start.
 
-    With the model "every_walk" each walk is also replayed with the deviations of the next one: see
-    `replayed`.
+    With the model "every_walk" each walk counts twice: as it was, and with the noise of the next
+    one (`replayed`).
 
     Args:
         pool: worker processes.
@@ -97,20 +97,23 @@ def _ground_job(campaign: Campaign, weights: Weights, command: Command, log: Log
 
 
 def replayed(residuals: Any, others: Any, cycle: int) -> Any:
-    """Return residuals with the deviations of those of another walk, half a walk later.
+    """Return the residuals of a walk with the noise of another, half a walk later.
 
-    The mean at each phase of the gait cycle stays, and the deviations from it change: weights that
-    fit only the noise of one walk gain nothing in such a replay.
+    The mean at each phase of the gait cycle stays. The noise is what deviates from it: weights that
+    fit that of one walk gain nothing in a replay with another.
 
     Args:
         residuals, others: trees of the same shapes (T, ...).
         cycle: ticks of the gait cycle.
     """
+    ticks = len(jax.tree.leaves(residuals)[0])
+    phase, late = np.arange(ticks) % cycle, cycle * (ticks // (2 * cycle))
 
-    def replay(own: Any, others: Any) -> Any:
-        phase = np.arange(len(own)) % cycle
-        mean = lambda x: np.stack([x[phase == i].mean(axis=0) for i in range(phase.max() + 1)])  # noqa: E731
-        late = cycle * (len(own) // (2 * cycle))
-        return mean(own)[phase] + np.roll(others - mean(others)[phase], late, axis=0)
+    def mean(x: Any) -> Any:
+        """Return the mean at the phase of each tick."""
+        return np.stack([x[phase == i].mean(axis=0) for i in range(min(cycle, ticks))])[phase]
+
+    def replay(own: Any, other: Any) -> Any:
+        return mean(own) + np.roll(other - mean(other), late, axis=0)
 
     return jax.tree.map(replay, residuals, others)
