@@ -687,6 +687,20 @@ def test_derivative_is_finite_where_it_is_one_sided():
     assert np.isfinite(moved).all()
 
 
+def test_data_that_is_not_finite_is_told_and_moves_nothing():
+    @jax.jit
+    def pull(qp):
+        return jax.grad(lambda qp: jnp.sum((found := solve_qp(qp)).x + found.y[0]))(qp)
+
+    for number in (np.nan, np.inf, -np.inf):
+        for part in "PqA":
+            value = np.array(getattr(good := small(l=(-1.0,), u=(1.0,)), part))
+            value.flat[0] = number
+            qp = good._replace(**{part: value})
+            assert along(qp, good)[0].status == Status.BAD_DATA
+            assert not np.any(np.concatenate([along(qp, good)[1], *map(np.ravel, pull(qp))]))
+
+
 def test_residuals_have_no_slope():
     """They are evidence; a loss that holds them is not pulled by their rounding."""
 

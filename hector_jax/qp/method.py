@@ -192,7 +192,8 @@ def solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, Normal]:
     """Solve a QP. Returns the solution, W (2, m) of its derivative and the normalised problem."""
     tolerances = config.tolerances(qp.q.dtype)
     no_bound = jnp.isnan(qp.l) | jnp.isnan(qp.u) | (qp.l >= INFINITE) | (qp.u <= -INFINITE)
-    valid = jnp.all(jnp.isfinite(qp.q)) & jnp.all(jnp.isfinite(qp.A)) & ~jnp.any(no_bound)
+    vectors = jnp.isfinite(qp.q) & jnp.isfinite(jnp.diagonal(qp.P))
+    valid = jnp.all(vectors) & jnp.all(jnp.isfinite(qp.A)) & ~jnp.any(no_bound)
     # zeros replace invalid data, so that no NaN reaches the solver; a P with one is not convex
     rest = where(valid, qp[1:], jax.tree.map(jnp.zeros_like, qp[1:]))
     normal = normalise(tolerances, QP(qp.P, *rest))
@@ -216,7 +217,6 @@ def solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, Normal]:
     y = normal.size * normal.row * multiplier(point.z)
     primal = jnp.maximum(primal, unmet)
     solution = Solution(x, y, primal, dual, gap, best.iterations, status)
-    normal = normal._replace(P=jnp.where(valid, normal.P, 0.0))
     return solution, _ratios(tolerances, normal, point), normal
 
 
