@@ -2,11 +2,13 @@
 
 The loss, for forces and moments apart, is the mean square of the standardised error plus
 l2/2 |kernels|^2, minimised by Adam (in the paper: 1e-3, 1e-3, 200 epochs). All axes count equally,
-as each is divided by its own spread. Several nets of one kind are trained side by side, and each
-keeps the epoch with its least mean square error (N^2, (N m)^2) on validation walks.
+as each is divided by its own spread. Several nets of one kind are trained side by side, the kinds
+on a core each, and each net keeps the epoch with its least mean square error (N^2, (N m)^2) on
+validation walks.
 """
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, NamedTuple, TypeVar
@@ -146,10 +148,12 @@ def apply_net(params: dict[str, Any], x: Float[Array, "*batch n"]) -> Float[Arra
 
 
 class _Carry(NamedTuple):
-    nets: ByKind  # parameters, members stacked
+    """State of the training of the nets of one kind, stacked."""
+
+    nets: Any  # parameters
     optimiser: Any  # its state
-    best: ByKind  # parameters of each member's epoch with the least validation error
-    best_error: ByKind  # that error, by member
+    best: Any  # parameters of each member's epoch with the least validation error
+    best_error: Float[Array, " members"]  # that error
 
 
 def fit_nets(
@@ -181,27 +185,38 @@ def fit_nets(
     Raises:
         InputError: no epoch has a finite validation error.
     """
-    members = len(jax.tree.leaves(nets)[0])
-    infinite = jnp.full(members, jnp.inf, jnp.float32)
+    infinite = jnp.full(len(jax.tree.leaves(nets)[0]), jnp.inf, jnp.float32)
     # traced: another rate needs no new compilation
     rates, rows = (config.learning_rate, config.l2), []
-    carry = _Carry(nets, _optimiser(*rates).init(nets), nets, (infinite,) * len(nets))
-    for epoch, key_epoch in enumerate(jax.random.split(key, config.epochs), start=1):
-        carry, row = _train_epoch(
-            carry,
-            key_epoch,
+    optimiser = _optimiser(*rates)
+    carries = [_Carry(net, optimiser.init(net), net, infinite) for net in nets]
+
+    def train(kind: int, key: Key[Array, ""]) -> Float[np.ndarray, "2"]:
+        """Train the nets of a kind for an epoch."""
+        carries[kind], row = _train_epoch(
+            carries[kind],
+            key,
             output=output,
             size=config.batch,
             rates=rates,
-            scale=scale,
-            training=training,
-            validation=validation,
+            scale=scale[kind],
+            training=_of_kind(training, kind),
+            validation=_of_kind(validation, kind),
         )
-        rows.append(jax.device_get(row))
-        progress(epoch, History(*np.array(rows).T))
-    if not all(np.isfinite(error).all() for error in carry.best_error):
+        return jax.device_get(row)
+
+    with ThreadPoolExecutor(len(nets)) as threads:
+        for epoch, key_epoch in enumerate(jax.random.split(key, config.epochs), start=1):
+            row = np.array([*threads.map(partial(train, key=key_epoch), range(len(nets)))]).T
+            rows.append(np.pad(row, ((0, 0), (0, 2 - len(nets)))).ravel())
+            progress(epoch, History(*np.array(rows).T))
+    if not all(np.isfinite(carry.best_error).all() for carry in carries):
         raise InputError("training diverged: no epoch has a finite validation error")
-    return carry.best, History(*np.array(rows).T)
+    return tuple(carry.best for carry in carries), History(*np.array(rows).T)
+
+
+def _of_kind(samples: Samples, kind: int) -> Samples:
+    return samples._replace(x=samples.x[kind], y=samples.y[kind])
 
 
 def _optimiser(learning_rate: Any, l2: Any) -> optax.GradientTransformation:
@@ -211,15 +226,16 @@ def _optimiser(learning_rate: Any, l2: Any) -> optax.GradientTransformation:
     return optax.chain(optax.add_decayed_weights(l2, mask=kernels), optax.adam(learning_rate))
 
 
-def _squares(output: Callable[[Array, Array], Array], nets: ByKind, samples: Samples) -> ByKind:
-    """Return the mean square of the standardised error per member and output."""
+def _squares(
+    output: Callable[[Array, Array], Array], nets: Any, samples: Samples
+) -> Float[Array, "members outputs"]:
+    """Return the mean square of the standardised error of nets of one kind."""
 
-    def square(net: Any, x: Array, y: Array) -> Array:
-        error = output(apply_net(net, x), samples.trust) - y
-        return jnp.mean(error**2, axis=tuple(range(y.ndim - 1)))
+    def square(net: Any) -> Array:
+        error = output(apply_net(net, samples.x), samples.trust) - samples.y
+        return jnp.mean(error**2, axis=tuple(range(samples.y.ndim - 1)))
 
-    by_member = jax.vmap(square, in_axes=(0, None, None))
-    return tuple(map(by_member, nets, samples.x, samples.y))
+    return jax.vmap(square)(nets)
 
 
 @partial(jax.jit, static_argnames=("output", "size"))
@@ -230,36 +246,33 @@ def _train_epoch(
     output: Callable[[Array, Array], Array],
     size: int,
     rates: tuple[Any, Any],  # numbers or tracers
-    scale: ByKind,
+    scale: Float[Array, " outputs"],
     training: Samples,
     validation: Samples,
-) -> tuple[_Carry, Float[Array, "4"]]:
-    count = len(training.x[0])
+) -> tuple[_Carry, Float[Array, "2"]]:
+    """Return the next state, and the errors of training and validation, means over the members."""
+    count = len(training.x)
     batch = min(size, count)
     order = jax.random.permutation(key, count)[: count // batch * batch].reshape(-1, batch)
     optimiser = _optimiser(*rates)
 
-    def loss(nets: ByKind, samples: Samples) -> tuple[Float[Array, ""], ByKind]:
+    def loss(nets: Any, samples: Samples) -> tuple[Float[Array, ""], Array]:
         squares = _squares(output, nets, samples)
-        return jax.tree.reduce(jnp.add, [s.mean(axis=1).sum() for s in squares]), squares
+        return squares.mean(axis=1).sum(), squares
 
-    def step(state: tuple[Any, Any], rows: Int[Array, " batch"]) -> tuple[tuple[Any, Any], ByKind]:
+    def step(state: tuple[Any, Any], rows: Int[Array, " batch"]) -> tuple[tuple[Any, Any], Array]:
         nets, opt_state = state
         samples = jax.tree.map(lambda a: a[rows], training)
         gradient, squares = jax.grad(loss, has_aux=True)(nets, samples)
         update, opt_state = optimiser.update(gradient, opt_state, nets)
         return (optax.apply_updates(nets, update), opt_state), squares
 
-    def keep_best(error: Array, best_error: Array, new: Any, old: Any) -> Any:
-        return jax.tree.map(partial(jax.vmap(jnp.where), error < best_error), new, old)
-
     (nets, opt_state), squares = jax.lax.scan(step, (carry.nets, carry.optimiser), order)
-    variance = jax.tree.map(jnp.square, scale)
-    physical = partial(jax.tree.map, lambda square, v: jnp.mean(square * v, axis=-1))
-    error = physical(_squares(output, nets, validation), variance)
-    best = tuple(map(keep_best, error, carry.best_error, nets, carry.best))
-    best_error = jax.tree.map(jnp.fmin, error, carry.best_error)
-    train_error = physical(jax.tree.map(lambda s: s.mean(axis=0), squares), variance)
-    means = jnp.array([[x.mean() for x in errors] for errors in (train_error, error)])
-    row = jnp.pad(means, ((0, 0), (0, 2 - len(nets)))).ravel()
-    return _Carry(nets, opt_state, best, best_error), row
+    train_error, error = (
+        jnp.mean(x * jnp.square(scale), axis=-1)
+        for x in (squares.mean(axis=0), _squares(output, nets, validation))
+    )
+    keep_best = partial(jax.vmap(jnp.where), error < carry.best_error)
+    best = jax.tree.map(keep_best, nets, carry.best)
+    best_error = jnp.fmin(error, carry.best_error)
+    return _Carry(nets, opt_state, best, best_error), jnp.array([train_error.mean(), error.mean()])
