@@ -20,8 +20,19 @@ from multiprocessing import active_children, parent_process
 from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
 
+from threadpoolctl import threadpool_limits
+
 from hector_jax.core.inputs import InputError, check_utf8, one_line, outside_packages
 from hector_jax.core.numerics import pin_options
+
+COMPILER_OPTIONS = {
+    # on a GPU small kernels that do not need each other run side by side
+    "xla_gpu_command_buffer_scheduling_mode": "CONCURRENT",
+    # On a CPU each reduction sets up memory, which takes longer than a short one itself. For one of
+    # more than 32 numbers XLA would make two.
+    "xla_disable_hlo_passes": "tree_reduction_rewriter",
+}
+"""For `jax.jit` of programs of many small operations: plans, and rollouts."""
 
 
 def cache_folder() -> Path:
@@ -77,8 +88,12 @@ def setup_jax() -> None:
     dispatched synchronously, and Python's garbage collector runs less often.
     """
     import jax
+    import scipy.linalg  # noqa: F401  # loads the LAPACK that XLA calls
 
     pin_options()
+    # Its threads would wait for each other in small systems, and the number of cores would change
+    # the rounding of results.
+    threadpool_limits(1, user_api="blas")
     # Run a CPU program in the calling thread: waking another thread takes as long as the small
     # programs of a walk.
     jax.config.update("jax_cpu_enable_async_dispatch", False)
