@@ -30,7 +30,7 @@ def one(ticks: int, batch: int, repeats: int) -> dict[str, float]:
 
     from hector_jax.control.reference import named_command, standing_anchor
     from hector_jax.control.weights import nominal
-    from hector_jax.core.runtime import COMPILER_OPTIONS, setup_jax
+    from hector_jax.core.runtime import setup_jax
     from hector_jax.grfm.effect import last_command
     from hector_jax.robot.model import load_robot
     from hector_jax.tuning.difftune import TuneConfig, tune_step
@@ -52,7 +52,7 @@ def one(ticks: int, batch: int, repeats: int) -> dict[str, float]:
         )
         run = jax.vmap(run)
     start = time.perf_counter()
-    lowered = jax.jit(run, compiler_options=COMPILER_OPTIONS).lower(weights)
+    lowered = jax.jit(run).lower(weights)
     trace_time = time.perf_counter() - start
     compiled = lowered.compile()
     compile_time = time.perf_counter() - start

@@ -29,7 +29,7 @@ from benchmarks import exact
 from benchmarks.peers import Traced, compiled_peers, traced_peers
 from benchmarks.problems import INPUTS, Problem, Ready, condense, draw_problems, layer_qp, pick
 from hector_jax.control.controller import WalkConfig
-from hector_jax.core.runtime import COMPILER_OPTIONS, setup_jax
+from hector_jax.core.runtime import setup_jax
 from hector_jax.core.trajectory import State
 from hector_jax.qp import QP, Status, solve_qp
 from hector_jax.robot.model import Robot, load_robot
@@ -130,11 +130,10 @@ def _timed(function: Callable, problems: Problem, how: str) -> Callable[[], obje
     """A run of one problem's function over all of them, to be timed."""
     batch = jax.device_put(problems)
     if how == "one by one":
-        run = jax.jit(function, compiler_options=COMPILER_OPTIONS)
+        run = jax.jit(function)
         ones = [pick(batch, i) for i in range(len(problems.pull))]
         return lambda: [jax.block_until_ready(run(one)) for one in ones]
-    over = jax.vmap(function) if how == "vmap" else partial(jax.lax.map, function)
-    run = jax.jit(over, compiler_options=COMPILER_OPTIONS)
+    run = jax.jit(jax.vmap(function) if how == "vmap" else partial(jax.lax.map, function))
     return lambda: jax.block_until_ready(run(batch))
 
 

@@ -18,9 +18,10 @@ from benchmarks.qp_layer import layer, ours
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal
-from hector_jax.core.runtime import COMPILER_OPTIONS, setup_jax
+from hector_jax.core.runtime import setup_jax
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
+from hector_jax.tuning.batch import COMPILER_OPTIONS
 from hector_jax.tuning.difftune import TuneConfig, tune_step
 from hector_jax.tuning.rollout import Scenario
 

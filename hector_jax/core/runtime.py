@@ -25,16 +25,6 @@ from threadpoolctl import threadpool_limits
 from hector_jax.core.inputs import InputError, check_utf8, one_line, outside_packages
 from hector_jax.core.numerics import pin_options
 
-COMPILER_OPTIONS = {
-    # on a GPU small kernels that do not need each other run side by side
-    "xla_gpu_command_buffer_scheduling_mode": "CONCURRENT",
-    # On a CPU each reduction sets up memory, which takes longer than a short one itself. For one of
-    # more than 32 numbers XLA would make two.
-    "xla_disable_hlo_passes": "tree_reduction_rewriter",
-}
-"""For `jax.jit` of programs of many small operations: plans, and rollouts."""
-
-
 def cache_folder() -> Path:
     """Return the folder of the compilation cache, which is made.
 

@@ -25,7 +25,6 @@ from hector_jax.control.parameters import Parameters
 from hector_jax.control.reference import Anchor, anchor_at, standing_anchor, with_pieces
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
-from hector_jax.core.runtime import COMPILER_OPTIONS
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree import Layout, layout, pack, unpack
 from hector_jax.robot.mjcf import TIME_STEP
@@ -89,6 +88,11 @@ def _sampler(config: WalkConfig, constants: Layout, inputs: Layout) -> Callable[
     return jax.jit(samples)
 
 
+# Every call of a program sets up memory for each of its reductions, which takes longer than a short
+# one itself. For one of more than 32 numbers XLA would make two.
+_ONE_REDUCTION = {"xla_disable_hlo_passes": "tree_reduction_rewriter"}
+
+
 class _Planner:
     """The compiled plan of a tick, from packed trees to the packed memory and plan."""
 
@@ -109,7 +113,7 @@ class _Planner:
             self.layout = layout(result)
             return pack(result)
 
-        self.plan = jax.jit(plan, compiler_options=COMPILER_OPTIONS)
+        self.plan = jax.jit(plan, compiler_options=_ONE_REDUCTION)
 
 
 _planner = cache(_Planner)

@@ -28,7 +28,6 @@ from jaxtyping import Float, Int
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
-from hector_jax.core.runtime import COMPILER_OPTIONS
 from hector_jax.robot.model import Robot
 from hector_jax.tuning import difftune
 from hector_jax.tuning.curvature import gauss_newton
@@ -43,6 +42,10 @@ from hector_jax.tuning.variation import Variation
 AXIS = "problems"
 PER_CALL = 11  # evaluations per problem and call of the device: start and ten
 TICKS_AT_ONCE = 8 * 400  # most on a GPU that are faster at once than in turn
+
+COMPILER_OPTIONS = {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
+"""For `jax.jit` of rollouts: on a GPU, small kernels that do not need each other run side by side
+(docs/performance.md); a CPU ignores it."""
 
 
 class BatchScenario(NamedTuple):

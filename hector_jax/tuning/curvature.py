@@ -16,7 +16,6 @@ from jaxtyping import Float
 from hector_jax.control.parameters import step_names, stepped
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
-from hector_jax.core.runtime import COMPILER_OPTIONS
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.tuning.evaluate import Walk
 from hector_jax.tuning.loss import Loss, losses, total
@@ -90,12 +89,7 @@ def gauss_newton(
     return matrix_of_walk(loss, trajectory, tangents)
 
 
-gauss_newton_jit = jax.jit(
-    gauss_newton,
-    static_argnums=0,
-    static_argnames=("walk", "others"),
-    compiler_options=COMPILER_OPTIONS,
-)
+gauss_newton_jit = jax.jit(gauss_newton, static_argnums=0, static_argnames=("walk", "others"))
 """`gauss_newton`, compiled once per rollout and set of terms."""
 
 

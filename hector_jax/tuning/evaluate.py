@@ -11,7 +11,6 @@ from jaxtyping import Float
 from hector_jax.control.weights import Weights, weights_to_vector
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError, unknown
-from hector_jax.core.runtime import COMPILER_OPTIONS
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.tuning.loss import Loss, Terms, losses, total, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
@@ -61,9 +60,7 @@ def evaluate(
     return Evaluation(value, terms, gradient, fallen, residual)
 
 
-evaluate_jit = jax.jit(
-    evaluate, static_argnums=0, static_argnames="walk", compiler_options=COMPILER_OPTIONS
-)
+evaluate_jit = jax.jit(evaluate, static_argnums=0, static_argnames="walk")
 """`evaluate`, compiled once per rollout and set of terms: new weights, commands, nets and alphas
 need no compilation."""
 
