@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info
 
 from hector_jax.core import runtime
 from hector_jax.core.numerics import add_flags, without_our_flags
@@ -33,6 +34,10 @@ def test_a_worker_computes_in_64_bits_and_draws_what_its_parent_draws(monkeypatc
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no binding to cores")
 def test_workers_share_out_the_cores():
     assert [runtime._claim_core([-1, -2]) for _ in range(4)] == [-1, -2, -1, -2]
+
+
+def test_linear_algebra_has_one_thread_whatever_the_cores():
+    assert {x["num_threads"] for x in threadpool_info() if x["user_api"] == "blas"} == {1}
 
 
 YNN, EMITTERS = "--xla_cpu_experimental_ynn_fusion_type=", "--xla_cpu_use_fusion_emitters=false"

@@ -25,6 +25,7 @@ from threadpoolctl import threadpool_limits
 from hector_jax.core.inputs import InputError, check_utf8, one_line, outside_packages
 from hector_jax.core.numerics import pin_options
 
+
 def cache_folder() -> Path:
     """Return the folder of the compilation cache, which is made.
 

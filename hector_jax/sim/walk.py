@@ -88,8 +88,8 @@ def _sampler(config: WalkConfig, constants: Layout, inputs: Layout) -> Callable[
     return jax.jit(samples)
 
 
-# Every call of a program sets up memory for each of its reductions, which takes longer than a short
-# one itself. For one of more than 32 numbers XLA would make two.
+# On a CPU every call of a program sets up memory for each of its reductions, which takes longer
+# than a short one itself. For one of more than 32 numbers XLA would make two, as it must on a GPU.
 _ONE_REDUCTION = {"xla_disable_hlo_passes": "tree_reduction_rewriter"}
 
 
@@ -113,7 +113,8 @@ class _Planner:
             self.layout = layout(result)
             return pack(result)
 
-        self.plan = jax.jit(plan, compiler_options=_ONE_REDUCTION)
+        options = _ONE_REDUCTION if jax.default_backend() == "cpu" else {}
+        self.plan = jax.jit(plan, compiler_options=options)
 
 
 _planner = cache(_Planner)
