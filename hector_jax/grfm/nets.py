@@ -70,10 +70,10 @@ _Params = TypeVar("_Params", bound=Any)
 
 
 class Samples(NamedTuple):
-    """Training samples of the nets, n of them."""
+    """Training samples of the nets, n of them; x and y by kind, or of one kind."""
 
-    x: ByKind  # inputs (n, ..., inputs)
-    y: ByKind  # standardised labels (n, ..., outputs)
+    x: Any  # inputs (n, ..., inputs)
+    y: Any  # standardised labels (n, ..., outputs)
     trust: Any  # (n, ..., 1) factor on the nets' outputs
 
 
