@@ -37,7 +37,7 @@ def test_workers_share_out_the_cores():
 
 
 def test_linear_algebra_has_one_thread_whatever_the_cores():
-    assert {x["num_threads"] for x in threadpool_info() if x["user_api"] == "blas"} == {1}
+    assert {x["num_threads"] for x in threadpool_info() if x["user_api"] == "blas"} <= {1}
 
 
 YNN, EMITTERS = "--xla_cpu_experimental_ynn_fusion_type=", "--xla_cpu_use_fusion_emitters=false"
