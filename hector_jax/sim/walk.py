@@ -89,7 +89,7 @@ def _sampler(config: WalkConfig, constants: Layout, inputs: Layout) -> Callable[
 
 
 # On a CPU every call of a program sets up memory for each of its reductions, which takes longer
-# than a short one itself. For one of more than 32 numbers XLA would make two, as it must on a GPU.
+# than a short one itself. For one of more than 32 numbers XLA would make two.
 _ONE_REDUCTION = {"xla_disable_hlo_passes": "tree_reduction_rewriter"}
 
 
