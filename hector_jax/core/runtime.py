@@ -76,7 +76,8 @@ def setup_jax() -> None:
     """Turn on 64 bits and the compilation cache; call before the first array.
 
     All of JAX's options that could change numbers are pinned (`core.numerics`). CPU programs are
-    dispatched synchronously, and Python's garbage collector runs less often.
+    dispatched synchronously, linear algebra on a CPU (NumPy's too) runs in one thread, and Python's
+    garbage collector runs less often.
     """
     import jax
     import scipy.linalg  # noqa: F401  # loads the LAPACK that XLA calls
