@@ -8,19 +8,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import sensitivity
+from lib import sample_weights
 from model import ANCHOR, CONFIG, LEARNS_TOUCHDOWNS, PLAIN, ROBOT, SHORT, small_effect
 
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.geometry import rot_z
+from hector_jax.core.tree import stack
 from hector_jax.grfm.dataset import make_dataset
 from hector_jax.grfm.effect import last_command
 from hector_jax.tuning.curvature import gauss_newton_jit
 from hector_jax.tuning.difftune import TuneConfig, init, step_status, tune_step
-from hector_jax.tuning.evaluate import gradient_norms
+from hector_jax.tuning.evaluate import evaluate, gradient_norms
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total, with_alphas
+from hector_jax.tuning.parallel_rollout import parallel_rollout
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.tuning.status import StepStatus
+from hector_jax.tuning.variation import drawn_variation
 
 LONG = RolloutConfig(ticks=400)
 STRAIGHT = Scenario(ROBOT, named_command("straight"), ANCHOR, PLAIN)
@@ -235,3 +239,28 @@ def test_the_derivatives_by_other_numbers_are_those_of_differences_and_of_the_re
     forward = sensitivity.matrix(PAPER_LOSS, *recursion, start(), OTHERS)
     matrix = gauss_newton_jit(SHORT, STRAIGHT, start(), PAPER_LOSS, others=OTHERS)
     np.testing.assert_allclose(forward, matrix, rtol=1e-8, atol=1e-9 * np.abs(matrix).max())
+
+
+@pytest.mark.skipif(jax.default_backend() != "gpu", reason="there is no GPU")
+@pytest.mark.parametrize("walked", [rollout, parallel_rollout])
+def test_gradients_of_64_varied_rollouts_on_a_gpu_are_those_of_the_cpu(walked):
+    scenarios = stack(
+        [
+            STRAIGHT._replace(
+                command=named_command(("straight", "c", "s", "sideways")[seed % 4]),
+                variation=drawn_variation(SHORT.walk, ROBOT, seed),
+            )
+            for seed in range(64)
+        ]
+    )
+    weights = stack(sample_weights(nominal(), 1.5, 64))
+    one = partial(evaluate, SHORT, loss=PAPER_LOSS, walk=walked)
+    found = {}
+    for platform in ("cpu", "gpu"):
+        with jax.default_device(jax.devices(platform)[0]):
+            inputs = jax.device_put((scenarios, weights), jax.devices(platform)[0])
+            found[platform] = jax.device_get(jax.jit(jax.vmap(lambda s, w: one(s, w)))(*inputs))
+    gpu, cpu = (jax.vmap(weights_to_vector)(found[on].gradient) for on in ("gpu", "cpu"))
+    size = np.linalg.norm(cpu, axis=1)
+    assert np.max(np.linalg.norm(gpu - cpu, axis=1) / size) < 1e-6
+    np.testing.assert_allclose(found["gpu"].loss, found["cpu"].loss, rtol=1e-9)

@@ -274,6 +274,7 @@ def _tune_sets(run: _Run, net: nets.TrainedNet) -> _Tuned:
         "best": points[chosen],
     }
     proposals, best = [], ""
+    _save_sets(run, sets)  # a tuning on walks may be long: what there is can be used meanwhile
     if run.args.walks:
         sets["before_walks"] = sets.pop("best")
         campaign = _campaign(run, sets["before_walks"])
@@ -282,9 +283,14 @@ def _tune_sets(run: _Run, net: nets.TrainedNet) -> _Tuned:
         engine = campaign.engine
         best = choice.walks_best(setup, stages, commands, choice.HELD_OUT, engine=engine, **options)
         sets["best"] = stages[best]
+        _save_sets(run, sets)
+    return _Tuned(net, done, sets, chosen, proposals, best)
+
+
+def _save_sets(run: _Run, sets: Mapping[str, Weights]) -> None:
+    """Write the weights of a run."""
     for name, weights in sets.items():
         save_weights(run.folder / "weights" / f"{name}.json", weights)
-    return _Tuned(net, done, sets, chosen, proposals, best)
 
 
 def _campaign(run: _Run, start: Weights) -> Campaign:

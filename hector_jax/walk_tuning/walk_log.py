@@ -29,6 +29,7 @@ class Log(NamedTuple):
     state: State  # (T, 3) each, at the end of each sample
     joints: Float[Any, "T joints"]  # [rad] leg by leg
     command: Wrench  # (T, feet, 3) each, held over the sample [N, N m]
+    contact: Bool[Any, "T feet"]  # planned stance; none in a log without this entry
     fallen: Bool[Any, " T"]
     residual: Float[Any, " T"]  # of the plans
 

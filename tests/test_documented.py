@@ -1,0 +1,172 @@
+"""Each command line of a page or of the help runs to its end, on what the lines before it made.
+
+As a user types them, but small: `SMALL` shortens the walks and the tunings of each command, and
+trajectories of the names in the pages are of 0.2 s. `PAIRS` are flags that meet in the code.
+"""
+
+import re
+import shlex
+import shutil
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from pretend import call
+from test_docs import READ, README, ROOT, lines_of
+from test_walks import HandsOver
+
+from hector_jax.cli import commands, evaluate, flags, propose, tune, verdict, walker
+from hector_jax.control.weights import expert
+from hector_jax.control.weights_file import save_weights
+from hector_jax.grfm.training import TrainConfig
+from hector_jax.store import nets
+from hector_jax.store.nets import CollectConfig
+
+SHORT = 'name = "{}"\n[[segment]]\nseconds = 0.2\nv_x = {}\n'
+SPEEDS = {"straight": 0.3, "c": 0.25, "s": 0.2, "slalom": 0.15}
+SMALL = {
+    "tune": "--iterations 1 --seeds 1 --no-video",
+    "evaluate": "--seeds 1",
+    "verdict": "--seeds 1 --model-seeds 1 --engine-seeds 1",
+    "collect": "--walks 3 --seconds 0.2 --engine c",
+    "train": "--epochs 1",
+    "search": "--budget 5 --population 4 --engine c",
+    "view": "--headless",
+}
+"""Flags that make a line of a command small, in the place of its own."""
+SECONDS = {"walk": 0.2, "evaluate": 0.2, "verdict": 0.2, "check": 1.5, "twin": 1.5}
+"""Lengths of the walks of a command; those of others are as long as a trajectory's file says."""
+ELSEWHERE = ("--cluster", "--help", "doctor")  # a scheduler; no work; the machine's
+
+
+def words_of(line):
+    """The words of a line as they are run here."""
+    command, *words = shlex.split(line, comments=True)[1:]
+    small = shlex.split(SMALL.get(command, ""))
+    for flag in {"--seeds", "--walks", "--budget", "--population", "--engine"} & {*small, *words}:
+        if flag in small and flag in words:
+            del words[words.index(flag) : words.index(flag) + 2]
+    if command == "tune" and "--walker" in words:
+        small = ["--seeds", "1"]
+    if command == "tune" and "--walks" in words:
+        words[words.index("--walks") + 1] = "12" if "c" in words else "4"
+    if command in ("tune", "search") and not {"--traj", "--resume", "--config"} & {*words}:
+        words += ["--traj", "straight"]
+    files = command not in SECONDS or "runs/robot" in line  # that `hector propose` was given
+    words = [one for word in words for one in found(word, files)]
+    if command in SECONDS and "--seconds" not in words and "short/" not in " ".join(words):
+        small += ["--seconds", str(SECONDS[command])]
+    return [command, *words, *small]
+
+
+def found(word, files):
+    """The words that stand for one: short trajectories, files that there are, the last run."""
+    name = Path(word).stem
+    if name == "slalom" or (files and word in SPEEDS):
+        return [f"short/{name}.toml"]
+    if "TIME" in word:
+        return [word.replace("runs/c/TIME", str(max(Path("runs/short-c").iterdir())))]
+    if "*" in word:
+        return sorted(map(str, Path().glob(word.replace("runs/", "runs/short-"))))
+    return [word.replace("$i", "0")]
+
+
+def documented(*pages):
+    """The lines of pages, each once, and those of the help."""
+    lines = [line for page in pages for line in lines_of(page, "hector")]
+    if README not in pages:
+        for kind in flags.COMMANDS.values():
+            lines += re.findall(r"Example: (hector .*)", kind.__doc__ or "")
+    bare = dict.fromkeys(re.sub(r"\s+#.*", "", line).strip() for line in lines)
+    return [line for line in bare if not any(word in line for word in ELSEWHERE)]
+
+
+PAIRS = [
+    "hector tune --traj straight --walks 4 --smooth 10 --out runs/smooth",
+    "hector export runs/smooth --set before_walks",
+    "hector tune --resume runs/smooth",
+    "hector tune --traj straight --walks 4 --alpha auto --tune all --out runs/auto",
+    "hector tune --traj straight --walks 4 --tune legs --walk-plants 0 --out runs/legs",
+    "hector tune --robot examples/quadruped/robot.toml --walks 4 --variant paper --out runs/four",
+    "hector view runs/four",
+    "hector export runs/four",
+    "hector tune --traj straight c --each --walks 4 --safe 0.05 --out runs/each",
+    "hector tune --resume runs/each/c",
+    "hector tune --traj straight --start best --alpha auto --verdict --json --out runs/judged",
+    "hector tune --traj straight --net data/more.npz --out runs/net",
+    "hector view runs/net",
+    "hector tune --resume runs/net",
+    "hector compare runs/smooth runs/net",
+    "hector tune --walker mine.py --robot mine.toml --walks 4 --out runs/own",
+    "hector tune --resume runs/own",
+]
+"""Lines of flags that meet in the code, in an order in which each has its input."""
+INPUTS = {
+    "hector report runs/robot log.npz": "hector walk --weights runs/robot/weights/0.json --traj s "
+    "--out log.npz",
+    "hector report runs/robot s.npz": "hector walk --weights runs/robot/weights/0.json --traj s "
+    "--out s.npz",
+    "hector check mine.npz --traj straight": "hector walk --traj straight --seconds 1.5 "
+    "--out mine.npz",
+    "hector evaluate --walker mine.py --robot mine.toml --traj c --weights mine.json best.json": ""
+    "hector walk --walker mine.py --robot mine.toml --out log.npz",
+}
+"""Lines whose input another page tells how to make, in words."""
+
+
+def all_lines():
+    """README's, which are quick, then those of the other pages and of the help, then pairs."""
+    first = ["hector tune --traj straight", *documented(README)]  # what `make tune` runs
+    rest = [line for line in documented(*READ) if line not in first]
+    yield from (pytest.param(line, id=line) for line in first)
+    yield from (pytest.param(line, id=line, marks=pytest.mark.slow) for line in (*rest, *PAIRS))
+
+
+@dataclass(frozen=True)
+class TwoEpochs(TrainConfig):
+    """A training that takes no time."""
+
+    epochs: int = 2
+
+
+@pytest.fixture(scope="module")
+def console(tmp_path_factory):
+    """A function that runs a line in a folder with all that a reader brings."""
+    small, pool = CollectConfig(walks=6, seconds=0.5), HandsOver()
+    own, four = ROOT / "examples" / "own_controller", ROOT / "examples" / "quadruped"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("reader"))
+        patch.setattr(nets, "CollectConfig", lambda: small)
+        patch.setattr(nets, "TrainConfig", TwoEpochs)
+        patch.setattr(nets, "tuning_paths", lambda *_: [])
+        for module in (commands, evaluate, propose, tune, verdict, walker):
+            patch.setattr(module, "workers", lambda *_: nullcontext(pool))
+        for folder in ("assets", "examples"):
+            Path(folder).symlink_to(ROOT / folder)
+        Path("short").mkdir()
+        for name, speed in SPEEDS.items():
+            Path(f"short/{name}.toml").write_text(SHORT.format(f"short-{name}", speed))
+        for name in ("controller.py", "hector.xml", "twin.toml"):
+            shutil.copy(own / name, name)
+        shutil.copy(own / "walker.py", "mine.py")
+        shutil.copy(own / "twin.toml", "mine.toml")
+        shutil.copy(four / "quadruped.xml", "h1.xml")
+        for name in ("mine", "best", *(f"runs/tuned/{name}" for name in SPEEDS)):
+            save_weights(Path(f"{name}.json"), expert())
+        yield lambda line: call(patch, *words_of(line))
+
+
+@pytest.mark.parametrize("line", list(all_lines()))
+def test_a_documented_line_runs_to_its_end(console, capsys, line):
+    for engine in ("drake", "pinocchio"):
+        if engine in line:
+            pytest.importorskip("pydrake" if engine == "drake" else engine)
+    if "propose" in line and "--traj" in line:
+        shutil.rmtree("runs/robot", ignore_errors=True)  # another reader begins anew
+    if line in INPUTS:
+        assert console(INPUTS[line]) == 0
+    code = console(line)
+    out, err = capsys.readouterr()
+    assert code == 0, err
+    assert "Traceback" not in out + err
