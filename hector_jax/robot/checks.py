@@ -121,7 +121,7 @@ def _check_standing(description: Description, model: mujoco.MjModel) -> None:
 def _check_load(description: Description, data: mujoco.MjData) -> None:
     """Check that each motor can hold its joint in the standing pose, the feet sharing the load."""
     model, trunk, feet = data.model, trunk_body(data.model), description.named_feet
-    com, torques = data.subtree_com[trunk], data.qfrc_bias.copy()
+    com, torques = data.subtree_com[trunk], data.qfrc_bias - data.qfrc_passive  # of springs
     force = -model.opt.gravity * model.body_subtreemass[trunk] / len(feet)
     for foot in feet:
         site = data.site(foot.point)

@@ -28,6 +28,7 @@ _JOINT = mujoco.mjtJoint
 _MOTOR = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE
 _LISTED = 12  # bodies
 _ENDLESS = 4.0 * np.pi  # [rad] of a range
+UNITS = 'rad in a URDF, degrees in an MJCF without <compiler angle="radian"/>'
 _MAX_FRICTION = 0.2  # of the robot's geoms; MuJoCo takes the larger friction of two geoms
 
 
@@ -138,9 +139,11 @@ def _check_joints(file: _File) -> None:
         if not model.jnt_limited[j] or np.ptp(model.jnt_range[j]) > _ENDLESS
     ]
     last = description.joints[description.leg_joints - 1 :: description.leg_joints]
+    limited = [name for name in endless if model.jnt_limited[model.joint(name).id]]
     text = f"joints {listed(endless)} turn without end, as wheels do, expected feet: fix them"
+    text += f"; or the ranges of {listed(limited)} have another unit: {UNITS}" * bool(limited)
     expect(path, not endless or not set(endless) <= set(last), text)
-    without = [name for name in endless if not model.jnt_limited[model.joint(name).id]]
+    without = [name for name in endless if name not in limited]
     text = f"joint {_nor(without)}, expected limits (in a URDF: revolute, lower and upper)"
     expect(path, not without, text.format("range"))
     for j in file.joints:
