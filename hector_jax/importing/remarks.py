@@ -10,7 +10,7 @@ from hector_jax.importing.survey import places_of
 from hector_jax.robot.checks import standing_data
 from hector_jax.robot.description import Description
 from hector_jax.robot.links import data_at
-from hector_jax.robot.model import Robot, build_model
+from hector_jax.robot.model import Robot, build_model, quiet_mujoco
 from hector_jax.robot.source import UNITS, Source, build_spec
 
 _HEAVY_LEGS = 0.35  # share of the robot's mass
@@ -18,12 +18,7 @@ _UNLIKE = 0.05  # least relative difference of the legs of a pair that is told
 _SHORTEST_SPAN, _FARTHEST = 0.1, 2.0 * np.pi  # [rad] of a range; others have probably another unit
 _DENSITY = 5.0, 5000.0  # [kg/m^3] of a robot's mass and the cube of its height
 _BACKWARDS = "if the robot looks along -x, turn the model so that x is ahead"
-_OPPOSITES = (  # a leg's place, its opposite, and where it is
-    ("front", "hind", "ahead"),
-    ("hind", "front", "behind"),
-    ("left", "right", "left"),
-    ("right", "left", "right"),
-)
+_OPPOSITES = (("front", "hind"), ("hind", "front"), ("left", "right"), ("right", "left"))
 _SPRING = 0.01  # share of the torque limit of a spring that is told, also at 1 rad
 _PLACEHOLDER = 10.0  # torque limit of no motor, times weight and height
 
@@ -31,6 +26,7 @@ Sides = tuple[Float[np.ndarray, "j n"], Float[np.ndarray, "j n"]]
 """A quantity of a leg by joint, and that of the other leg of the pair as its mirror image."""
 
 
+@quiet_mujoco()
 def remarks(robot: Robot) -> list[str]:
     """Return one line per likely cause of trouble in walking, with its remedy."""
     description, source = robot.description, build_spec(robot.description)
@@ -86,26 +82,26 @@ def _places(description: Description) -> Iterator[str]:
     """Yield one line if the names of two opposite legs each say the place of the other one."""
     joints = np.reshape(description.joints, (len(description.legs), -1)).tolist()
     said = {leg: places_of(own) for leg, own in zip(description.legs, joints, strict=True)}
-    told = []
-    for place, other, word in _OPPOSITES:
-        wrong = [leg for leg in said if place in leg and said[leg] & {place, other} == {other}]
-        wrong = [leg for leg in wrong if place in said[leg.replace(place, other)]]
-        names = ", ".join(joints[description.legs.index(leg)][0] for leg in wrong)
-        told += [f"{names} lie {word}"] * bool(wrong)
-    if told:
-        yield f"unlike their names say, {'; '.join(told)}: {_BACKWARDS}, or rename the joints"
+    if told := [
+        f"{own[0]} is {place}"
+        for place, other in _OPPOSITES
+        for leg, own in zip(said, joints, strict=True)
+        if place in leg and said[leg] & {place, other} == {other}
+        if place in said[leg.replace(place, other)]
+    ]:
+        yield f"places differ from names, {', '.join(told)}: {_BACKWARDS}, or rename the joints"
 
 
 def _springs(robot: Robot, model: mujoco.MjModel) -> Iterator[str]:
     """Yield one line if springs turn joints of the legs."""
-    names, limits, stiffness = robot.description.joints, robot.torque_limit, model.jnt_stiffness[1:]
     torque = np.abs(standing_data(robot.description, model).qfrc_passive[6:])
-    if found := np.flatnonzero(np.maximum(stiffness, torque) > _SPRING * limits).tolist():
-        springs = (
-            f"{names[i]} ({stiffness[i]:.3g} N m/rad; standing {torque[i]:.3g} of {limits[i]:.3g} N m)"
-            for i in found
-        )
-        yield f"springs turn {', '.join(springs)}, and the controller knows of none: remove them"
+    values = zip(model.jnt_stiffness[1:], torque, robot.torque_limit, strict=True)
+    if told := [
+        f"{name} ({stiffness:.3g} N m/rad, standing {spring:.3g} of {limit:.3g} N m)"
+        for name, (stiffness, spring, limit) in zip(robot.description.joints, values, strict=True)
+        if max(stiffness, spring) > _SPRING * limit
+    ]:
+        yield f"springs turn {', '.join(told)}: the controller knows of none, remove them"
 
 
 def differences(robot: Robot) -> list[str]:

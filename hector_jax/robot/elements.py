@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import InputError, did_you_mean, short_repr
+from hector_jax.core.inputs import short_repr
 from hector_jax.robot.checks import expect, listed
 from hector_jax.robot.links import MASSLESS
 from hector_jax.robot.mjcf import mujoco_errors, text_of
@@ -189,28 +189,22 @@ def _clean_urdf(path: Path, root: ElementTree.Element, joints: Sequence[str]) ->
 
 def _check_tree(path: Path, root: ElementTree.Element) -> None:
     """Refuse a URDF whose links and joints are no tree: MuJoCo drops a link that nothing holds."""
-    for tag in ("link", "joint"):
-        names = [x.get("name", "") for x in root.findall(tag)]
-        expect(path, all(names), f"a {tag} has no name")
-        twice = sorted({name for name in names if names.count(name) > 1})
-        expect(path, not twice, f"{tag} {listed(twice)} is there twice, expected different names")
-    links, above = [x.get("name", "") for x in root.findall("link")], {}
+    links, joints = ([x.get("name", "") for x in root.findall(tag)] for tag in ("link", "joint"))
+    twice = {x for names in (links, joints) for x in names if not x or names.count(x) > 1}
+    text = f"names of links and of joints must differ, got {sorted(twice)} empty or twice"
+    expect(path, not twice, text)
+    above: dict[str, str] = {}
     for joint in root.findall("joint"):
-        name, ends = short_repr(joint.get("name")), joint.findall("parent") + joint.findall("child")
-        parent, child = ([x.get("link", "") for x in ends] + ["", ""])[:2]
-        for link in (parent, child):
-            if link not in links:
-                hint = did_you_mean(link, links)
-                raise InputError(f"{path}: joint {name} joins no link {short_repr(link)}{hint}")
-        expect(path, child not in above, f"link {child!r} has two parents; one is of joint {name}")
-        above[child] = parent
+        ends = [x.get("link", "") for tag in ("parent", "child") for x in joint.findall(tag)]
+        text = f"joint {joint.get('name')!r} joins {ends}, expected its parent and child, two links"
+        expect(path, len(ends) == 2 and {*ends} <= {*links}, text)
+        expect(path, ends[1] not in above, f"{text}, and no other joint to have this child")
+        above[ends[1]] = ends[0]
     tops = list(links)
     for _ in links:
-        tops = [above.get(link, link) for link in tops]
+        tops = [above.get(top, top) for top in tops]
     ring = [link for link, top in zip(links, tops, strict=True) if top in above]
-    expect(path, not ring, f"links {listed(ring)} hang in a ring, expected one tree of links")
-    roots = sorted({*tops}, key=tops.count, reverse=True)
-    text = (
-        f"no joint holds {listed(roots[1:])}, expected one tree of links, below {listed(roots[:1])}"
-    )
+    expect(path, not ring, f"links {listed(ring)} hang in a ring, expected one tree")
+    roots = sorted({*tops}, key=tops.count)  # that of the robot is last
+    text = f"no joint holds {listed(roots[:-1])}, expected one tree below {listed(roots[-1:])}"
     expect(path, len(roots) < 2, text)

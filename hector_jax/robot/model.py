@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
+from warnings import catch_warnings
 
 import jax
 import numpy as np
@@ -47,7 +48,7 @@ def quiet_mujoco() -> Iterator[None]:
 def conversion(path: Path) -> Iterator[None]:
     """Raise as an InputError whatever MuJoCo, SciPy or a name raises while a file is converted."""
     try:
-        with quiet_mujoco():
+        with quiet_mujoco(), catch_warnings(action="ignore", category=UserWarning):
             yield
     except InputError:
         raise
