@@ -288,6 +288,15 @@ def test_the_mass_of_a_urdf_is_that_of_all_its_links_whatever_is_drawn(tmp_path)
     assert model.body_mass.sum() == pytest.approx(sum(masses), rel=1e-12)
 
 
+def test_a_mass_beside_the_robot_is_left_out_and_told(tmp_path):
+    lamp = '<body name="lamp"><geom size="1" mass="9" contype="0" conaffinity="0"/></body>'
+    source = build_spec(small(tmp_path, more=f"<worldbody>{lamp}</worldbody>"))
+    assert "left out, which no joint holds: lamp" in source.notes
+    assert source.spec.compile().body_mass.sum() == pytest.approx(
+        compiled(small(tmp_path)).body_mass.sum()
+    )
+
+
 def test_names_are_the_files_own_and_what_has_none_gets_one(tmp_path):
     description = small(tmp_path)
     expected, path = compiled(description), description.model

@@ -177,24 +177,17 @@ def pairs_of(
         coms = data.xipos[bodies[one]] - places[0], data.xipos[bodies[two]] * mirror - places[1]
         span, standing = model.jnt_range, model.key_qpos[0, 6:, None]
         left, right = ([names[j - 1] for j in leg] for leg in legs)
-        yield (
-            left,
-            right,
-            {
-                "axis": (axes[0], sign * axes[1]),
-                "range [rad]": (
-                    span[one],
-                    np.where(sign < 0.0, -span[two][:, ::-1], span[two]),
-                ),
-                "standing [rad]": (standing[one], sign * standing[two]),
-                "place [m]": tuple(np.diff(x, axis=0, prepend=0.0) for x in places),
-                "centre of mass [m]": coms,
-                **{
-                    x: tuple(y[leg].reshape(len(leg), -1) for leg in legs)
-                    for x, y in scalars.items()
-                },
-            },
-        )
+        mirrored = np.where(sign < 0.0, -span[two][:, ::-1], span[two])
+        has: dict[str, Sides] = {
+            "axis": (axes[0], sign * axes[1]),
+            "range [rad]": (span[one], mirrored),
+            "standing [rad]": (standing[one], sign * standing[two]),
+            "place [m]": tuple(np.diff(x, axis=0, prepend=0.0) for x in places),
+            "centre of mass [m]": coms,
+        }
+        for quantity, values in scalars.items():
+            has[quantity] = tuple(values[leg].reshape(len(leg), -1) for leg in legs)
+        yield left, right, has
 
 
 def range_words(span: Float[np.ndarray, "2"]) -> str:

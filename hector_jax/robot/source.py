@@ -257,6 +257,9 @@ def _changes(file: _File, limits: Sequence[float], links: Sequence[Link]) -> lis
     """Return one line per reason to rebuild a robot; none if it has the standard form."""
     description, model = file.description, file.model
     inside = [b for b in range(1, model.nbody) if model.body_rootid[b] == file.trunk]
+    beside = [
+        model.body(b).name for b in {*range(1, model.nbody)} - {*inside} if model.body_mass[b]
+    ]
     static = [model.body(b).name for b in inside if not model.body_jntnum[b] and b != file.trunk]
     more = f" and {len(static) - _LISTED} more" if len(static) > _LISTED else ""
     order = [file.free, *file.joints] == list(range(model.njnt))
@@ -267,6 +270,7 @@ def _changes(file: _File, limits: Sequence[float], links: Sequence[Link]) -> lis
         ("free joint added to the trunk", file.free < 0),
         (f"fixed: {listed(description.weld)}", description.weld),
         (f"made one with their parents: {listed(static[:_LISTED])}{more}", static),
+        (f"left out, which no joint holds: {listed(beside)}", beside),
         ("joints put in order, leg by leg", file.free >= 0 and not (order or description.weld)),
         ("frames of the joints put into their anchors", not at_origin and order),
         (f"torque motors {motors}", not _motors_match(file, limits)),
