@@ -49,6 +49,62 @@ def test_the_example_is_what_is_proposed_for_its_model():
     assert proposal.survey.forwards == (False, False)
 
 
+@pytest.mark.parametrize("ahead", [0.0, 0.3])
+def test_an_anchor_may_be_anywhere_on_its_axis(tmp_path, ahead):
+    """Also where the anchors of the hind legs are ahead of those of the front legs."""
+
+    def proposed(roll, pitch):
+        changes = [
+            (rf'(<joint name="{end}_\w+_roll")', rf'\1 pos="{x} 0 0"') for end, x in roll.items()
+        ]
+        for side, x in (("left", ahead), ("right", -ahead)):
+            pose = f'axis="{x} 0.95 0" pos="{x * pitch} {0.95 * pitch} 0"'
+            changes.append((rf'(<joint name="\w+_{side}_pitch")', rf"\1 {pose}"))
+        return propose_robot(changed(tmp_path, *changes))
+
+    own, got = proposed({}, 0.0), proposed({"front": -0.3, "hind": 0.3}, 0.06)
+    assert got.error is None
+    assert got.table["joints"] == own.table["joints"]
+    assert got.table["standing"] == pytest.approx(own.table["standing"], abs=2e-4)
+    for name in ("standing_height", "foot_ahead"):
+        values = (getattr(x.robot, name) for x in (got, own))
+        np.testing.assert_allclose(*values, atol=1e-4)
+
+
+def test_springs_are_told_and_are_part_of_the_load(tmp_path):
+    knee = '<joint range="-2.7227 -0.83776"'
+    for stiffness in (0, 60, 300):
+        spring = (knee, f'{knee} stiffness="{stiffness}" springref="-1.5"')
+        proposal = propose_robot(changed(tmp_path, spring))
+        lines = [line for line in remarks(proposal.robot) if "springs turn" in line]
+        text = f"front_left_knee ({stiffness} N m/rad, standing {stiffness / 2:.3g} of 45.4 N m)"
+        assert [text in line for line in lines] == [True] * (stiffness > 0)
+        assert ("standing takes" in (proposal.error or "")) == (stiffness == 300)
+    hip = ('<joint axis="1 0 0"', '<joint axis="1 0 0" stiffness="5"')
+    (line,) = [x for x in remarks(propose_robot(changed(tmp_path, hip)).robot) if "springs" in x]
+    assert "hind_right_roll (5 N m/rad, standing 0 of 23.7 N m)" in line
+
+
+NAMED = [  # names of the legs in the file, and what is told
+    (LEGS, ""),
+    (("lf", "rf", "lh", "rh"), ""),
+    (("FL", "FR", "RL", "RR"), ""),
+    (("a", "b", "c", "d"), ""),
+    (LEGS[2:] + LEGS[:2], "hind_left_roll is front, hind_right_roll is front, front_left_roll is "),
+    (("FR", "FL", "RL", "RR"), "names, FR_roll is left, FL_roll is right: "),
+    (("RR", "RL", "FR", "FL"), "RR_roll is front, .* FL_roll is hind, RR_roll is left, FR_roll"),
+]
+
+
+@pytest.mark.parametrize(("names", "told"), NAMED)
+def test_names_of_other_places_are_told(tmp_path, names, told):
+    path, new = changed(tmp_path), dict(zip(LEGS, names, strict=True))
+    path.write_text(re.sub("|".join(LEGS), lambda x: new[x[0]], path.read_text()))
+    lines = [line for line in remarks(propose_robot(path).robot) if "places" in line]
+    assert len(lines) == bool(told)
+    assert all(re.search(told, line) and "looks along -x" in line for line in lines)
+
+
 def test_legs_are_found_in_any_order_and_by_any_name(tmp_path):
     text = MODEL.read_text()
     for i, leg in enumerate(LEGS):

@@ -8,7 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from pretend import call
+from pretend import call, refused
 from published import JOINTS, small
 
 from hector_jax.control.controller import walk_config
@@ -119,8 +119,18 @@ REFUSED = [  # what is told, and changes of the small biped
     ("'left_roll' has no range, nor have left_pitch, left_knee, ", (' range="[^"]*"', "")),
     ("'left_roll' has no torque limit, nor have left_pitch, .*joints.weld", (MOTORS, "")),
     ("right_ankle turn without end, as wheels do", (r'(_ankle.*) range="-1 1"', r"\1")),
+    ("right_ankle turn .* another unit: rad", (r'(_ankle.*) range="-1 1"', r'\1 range="10 60"')),
+    (r"expected it in its range \[10. 16.\]", (r'(_ankle.*) range="-1 1"', r'\1 range="10 16"')),
     (r"'base' 0\.\d+ m below the floor", ('0.08 0.1"/>', '0.08 0.1" pos="0 0 -0.45"/>')),
 ]
+
+
+def test_a_file_in_another_folder_is_refused(monkeypatch, capsys, tmp_path):
+    path = tmp_path / "own.toml"
+    for model in ("sub/robot.xml", "", ".", "/"):
+        path.write_text(f"model = {model!r}\n")
+        line = refused(monkeypatch, capsys, "robot", path)
+        assert re.search("model must name a file beside it|model is missing", line)
 
 
 @pytest.mark.parametrize("case", REFUSED, ids=lambda case: case[0])

@@ -1,5 +1,7 @@
 """Robots as published, brought to one form: what is kept, what is mended, what is refused."""
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -249,3 +251,75 @@ def test_a_keyframe_of_the_file_is_kept_when_joints_are_welded(tmp_path):
     assert [got.key(i).name for i in range(got.nkey)] == ["up"]
     np.testing.assert_array_equal(got.key_qpos, by_angles.key_qpos)
     np.testing.assert_array_equal(got.body_inertia, by_angles.body_inertia)
+
+
+LINK = '<link name="payload"><inertial><mass value="5"/></inertial></link>'
+JOINT = '<joint name="{}" type="fixed"><parent link="{}"/><child link="{}"/></joint>'
+RING = LINK + '<link name="a"/>' + JOINT.format("j", "a", "payload")
+NO_TREE = {  # what is put into a URDF, and what is told
+    "a loose link": (LINK, "no joint holds payload, expected one tree below trunk"),
+    "a repeated link": ('<link name="left_foot"/>', "got ['left_foot'] empty or twice"),
+    "a repeated joint": (JOINT.format("left_knee", "trunk", "trunk"), "got ['left_knee'] empty or"),
+    "no name": ("<link/>", "got [''] empty or twice"),
+    "an unknown link": (JOINT.format("j", "trunk", "arm"), "joint 'j' joins ['trunk', 'arm'], exp"),
+    "one end": ('<joint name="j"><parent link="trunk"/></joint>', "joint 'j' joins ['trunk']"),
+    "two parents": (JOINT.format("j", "trunk", "left_foot"), "no other joint to have this child"),
+    "a ring": (RING + JOINT.format("k", "payload", "a"), "links payload, a hang in a ring"),
+}
+
+
+@pytest.mark.parametrize("kind", NO_TREE)
+def test_links_that_are_no_tree_are_refused_by_name(tmp_path, kind):
+    parts, text = NO_TREE[kind]
+    urdf = urdf_of(mujoco.MjModel.from_xml_path(str(MODEL_PATH)))
+    with pytest.raises(InputError) as caught:
+        build_spec(by_numbers(tmp_path, urdf.replace("</robot>", f"{parts}</robot>")))
+    assert text in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_mass_of_a_urdf_is_that_of_all_its_links_whatever_is_drawn(tmp_path):
+    drawn = '<visual><geometry><box size="0 0 0"/></geometry></visual></link>'
+    urdf = urdf_of(mujoco.MjModel.from_xml_path(str(MODEL_PATH))).replace("</link>", drawn)
+    held = LINK.replace("</i", '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></i')
+    urdf = urdf.replace("</robot>", f"{held}{JOINT.format('hold', 'trunk', 'payload')}</robot>")
+    masses = [float(x) for x in re.findall('<mass value="([^"]*)"', urdf)]
+    model = compiled(by_numbers(tmp_path, urdf))
+    assert model.body_mass.sum() == pytest.approx(sum(masses), rel=1e-12)
+
+
+def test_a_mass_beside_the_robot_is_left_out_and_told(tmp_path):
+    lamp = '<body name="lamp"><geom size="1" mass="9" contype="0" conaffinity="0"/></body>'
+    source = build_spec(small(tmp_path, more=f"<worldbody>{lamp}</worldbody>"))
+    assert "left out, which no joint holds: lamp" in source.notes
+    assert source.spec.compile().body_mass.sum() == pytest.approx(
+        compiled(small(tmp_path)).body_mass.sum()
+    )
+
+
+def test_names_are_the_files_own_and_what_has_none_gets_one(tmp_path):
+    description = small(tmp_path)
+    expected, path = compiled(description), description.model
+    text = path.read_text()
+    for old, new in (
+        ('<geom type="box" size="0.05', '<geom name="floor" type="box" size="0.05'),
+        ('<body name="[a-z]+_(hip|thigh|shin)"', "<body"),
+        ('name="waist" ', ""),
+        ("left_knee", "base"),
+        ("right_ankle", "floor"),
+        ('name="torso"', 'name="floor"'),
+    ):
+        assert re.search(old, text)
+        text = re.sub(old, new, text)
+    path.write_text(text)
+    names = {"left_knee": "base", "right_ankle": "floor", "waist": "joint_5"}
+    renamed = replace(
+        description,
+        joints=tuple(names.get(x, x) for x in description.joints),
+        weld=("joint_5", "shoulder"),
+        standing=tuple((names.get(x, x), angle) for x, angle in description.standing),
+    )
+    got = compiled(renamed)
+    for name in ("body_mass", "body_inertia", "jnt_range", "key_qpos", "geom_size"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(expected, name))
+    assert len({got.body(b).name for b in range(got.nbody)}) == got.nbody

@@ -42,7 +42,7 @@ from hector_jax.importing.soles import Sole, find_soles
 from hector_jax.importing.stand import standing_pose
 from hector_jax.importing.survey import Survey, survey_file
 from hector_jax.robot.description import MAX_BYTES, Description, Joints, description_of
-from hector_jax.robot.model import Robot, build_model, quiet_mujoco, robot_of
+from hector_jax.robot.model import Robot, build_model, conversion, robot_of
 from hector_jax.robot.response import (
     Response,
     planned_inertia,
@@ -71,7 +71,6 @@ class RobotProposal(NamedTuple):
     error: str | None = None  # why the robot cannot be used
 
 
-@quiet_mujoco()
 def propose_robot(path: Path) -> RobotProposal:
     """Return the proposed TOML of a model's file, or of a TOML file with what it leaves out.
 
@@ -81,26 +80,26 @@ def propose_robot(path: Path) -> RobotProposal:
     own: dict[str, Any] = {"model": path.name}
     if path.suffix == ".toml":
         own = read_toml(path, "the robot description", MAX_BYTES)
-        if not isinstance(own.get("model"), str):
-            description_of(path, own)  # refuses it
+    file = description_of(path, {"name": "robot", "model": own.get("model", "")}).model
     wrong, error = [], None
     stem = "".join(x if x.isalnum() or x in "-_" else "-" for x in path.stem)
     found = RobotProposal({"name": stem, **own}, (), [])
     try:
-        named = _named_legs(path, own)
-        if not (named and "feet" in own and "standing" in own):
-            found = _with_legs(survey_file(path.with_name(own["model"]), named), found)
-            found = _with_feet(found, wrong)
-        names = {key: found.table[key] for key in _NAMES if key in found.table}
-        description = description_of(path.with_suffix(".toml"), names)
-        if armature := _armature(description):
-            names["joints"] = _merged({"armature": armature}, names["joints"])
-            description = description_of(description.path, names)
-        robot = robot_of(description, checked=False)
-        table = _merged(_settings(robot), found.table | names)
-        description = description_of(description.path, table)
-        found = found._replace(table=table, robot=robot._replace(description=description))
-        robot_of(description)
+        with conversion(file):
+            named = _named_legs(path, own)
+            if not (named and "feet" in own and "standing" in own):
+                found = _with_legs(survey_file(file, named), found)
+                found = _with_feet(found, wrong)
+            names = {key: found.table[key] for key in _NAMES if key in found.table}
+            description = description_of(path.with_suffix(".toml"), names)
+            if armature := _armature(description):
+                names["joints"] = _merged({"armature": armature}, names["joints"])
+                description = description_of(description.path, names)
+            robot = robot_of(description, checked=False)
+            table = _merged(_settings(robot), found.table | names)
+            description = description_of(description.path, table)
+            found = found._replace(table=table, robot=robot._replace(description=description))
+            robot_of(description)
     except InputError as raised:
         error = str(raised)
         wrong.append(error)

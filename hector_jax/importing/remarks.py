@@ -6,20 +6,27 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hector_jax.core.headless import mujoco
+from hector_jax.importing.survey import places_of
+from hector_jax.robot.checks import standing_data
+from hector_jax.robot.description import Description
 from hector_jax.robot.links import data_at
-from hector_jax.robot.model import Robot, build_model
-from hector_jax.robot.source import Source, build_spec
+from hector_jax.robot.model import Robot, build_model, quiet_mujoco
+from hector_jax.robot.source import UNITS, Source, build_spec
 
 _HEAVY_LEGS = 0.35  # share of the robot's mass
 _UNLIKE = 0.05  # least relative difference of the legs of a pair that is told
 _SHORTEST_SPAN, _FARTHEST = 0.1, 2.0 * np.pi  # [rad] of a range; others have probably another unit
 _DENSITY = 5.0, 5000.0  # [kg/m^3] of a robot's mass and the cube of its height
+_BACKWARDS = "if the robot looks along -x, turn the model so that x is ahead"
+_OPPOSITES = (("front", "hind"), ("hind", "front"), ("left", "right"), ("right", "left"))
+_SPRING = 0.01  # share of the torque limit of a spring that is told, also at 1 rad
 _PLACEHOLDER = 10.0  # torque limit of no motor, times weight and height
 
 Sides = tuple[Float[np.ndarray, "j n"], Float[np.ndarray, "j n"]]
 """A quantity of a leg by joint, and that of the other leg of the pair as its mirror image."""
 
 
+@quiet_mujoco()
 def remarks(robot: Robot) -> list[str]:
     """Return one line per likely cause of trouble in walking, with its remedy."""
     description, source = robot.description, build_spec(robot.description)
@@ -27,6 +34,7 @@ def remarks(robot: Robot) -> list[str]:
     share, weight = float(robot.link_mass.sum() / robot.mass), float(robot.mass * robot.gravity[2])
     control = {name: dict(section) for name, section in description.control}
     lines = [*_units(robot), *differences(robot), *_overlaps(source, model)]
+    lines += [*_places(description), *_springs(robot, model)]
     if share > _HEAVY_LEGS and not control.get("legs", {}).get("gravity_compensation"):
         lines.append(
             f"the legs are {100 * share:.0f} % of the mass and lift the trunk when they stretch: "
@@ -42,10 +50,7 @@ def remarks(robot: Robot) -> list[str]:
         lines.append("no joint of a leg turns about z: the robot may fall in curves, walk straight")
     ahead = (robot.sole[0].T @ robot.foot_point[0])[0]  # of the last joint
     if robot.structure.contact != "point" and robot.heel - ahead > 1.2 * (robot.toe + ahead):
-        lines.append(
-            "the heel is longer than the toe: if the robot looks along -x, turn the model so that "
-            "x is ahead"
-        )
+        lines.append(f"the heel is longer than the toe: {_BACKWARDS}")
     force = control.get("mpc", {}).get("max_force", 500.0)
     if force < 1.5 * weight:
         lines.append(
@@ -62,10 +67,7 @@ def _units(robot: Robot) -> Iterator[str]:
     span, end = np.ptp(ranges, axis=1), np.abs(ranges).max(axis=1)
     if odd := np.flatnonzero((span < _SHORTEST_SPAN) | (end > _FARTHEST)).tolist():
         found = ", ".join(f"{names[i]} {range_words(ranges[i])}" for i in odd)
-        yield (
-            f"ranges of {found} have probably another unit: rad in a URDF, degrees in an MJCF "
-            'without <compiler angle="radian"/>'
-        )
+        yield f"ranges of {found} have probably another unit: {UNITS}"
     most = _PLACEHOLDER * mass * float(robot.gravity[2]) * height
     if odd := np.flatnonzero(limits > most).tolist():
         yield (
@@ -74,6 +76,32 @@ def _units(robot: Robot) -> Iterator[str]:
         )
     if not _DENSITY[0] <= mass / height**3 <= _DENSITY[1]:
         yield f"{mass:.3g} kg with a centre of mass {height:.3g} m high is no robot: write kg and m"
+
+
+def _places(description: Description) -> Iterator[str]:
+    """Yield one line if the names of two opposite legs each say the place of the other one."""
+    joints = np.reshape(description.joints, (len(description.legs), -1)).tolist()
+    said = {leg: places_of(own) for leg, own in zip(description.legs, joints, strict=True)}
+    if told := [
+        f"{own[0]} is {place}"
+        for place, other in _OPPOSITES
+        for leg, own in zip(said, joints, strict=True)
+        if place in leg and said[leg] & {place, other} == {other}
+        if place in said[leg.replace(place, other)]
+    ]:
+        yield f"places differ from names, {', '.join(told)}: {_BACKWARDS}, or rename the joints"
+
+
+def _springs(robot: Robot, model: mujoco.MjModel) -> Iterator[str]:
+    """Yield one line if springs turn joints of the legs."""
+    torque = np.abs(standing_data(robot.description, model).qfrc_passive[6:])
+    values = zip(model.jnt_stiffness[1:], torque, robot.torque_limit, strict=True)
+    if told := [
+        f"{name} ({stiffness:.3g} N m/rad, standing {spring:.3g} of {limit:.3g} N m)"
+        for name, (stiffness, spring, limit) in zip(robot.description.joints, values, strict=True)
+        if max(stiffness, spring) > _SPRING * limit
+    ]:
+        yield f"springs turn {', '.join(told)}: the controller knows of none, remove them"
 
 
 def differences(robot: Robot) -> list[str]:
@@ -137,6 +165,7 @@ def pairs_of(
         "armature [kg m^2]": model.dof_armature[dofs],
         "damping [N m s]": model.dof_damping[dofs],
         "friction [N m]": model.dof_frictionloss[dofs],
+        "spring [N m/rad]": model.jnt_stiffness,
     }
     for legs in np.arange(1, model.njnt).reshape(-1, 2, robot.joint_axis.shape[1]):
         one, two = legs
@@ -148,24 +177,17 @@ def pairs_of(
         coms = data.xipos[bodies[one]] - places[0], data.xipos[bodies[two]] * mirror - places[1]
         span, standing = model.jnt_range, model.key_qpos[0, 6:, None]
         left, right = ([names[j - 1] for j in leg] for leg in legs)
-        yield (
-            left,
-            right,
-            {
-                "axis": (axes[0], sign * axes[1]),
-                "range [rad]": (
-                    span[one],
-                    np.where(sign < 0.0, -span[two][:, ::-1], span[two]),
-                ),
-                "standing [rad]": (standing[one], sign * standing[two]),
-                "place [m]": tuple(np.diff(x, axis=0, prepend=0.0) for x in places),
-                "centre of mass [m]": coms,
-                **{
-                    x: tuple(y[leg].reshape(len(leg), -1) for leg in legs)
-                    for x, y in scalars.items()
-                },
-            },
-        )
+        mirrored = np.where(sign < 0.0, -span[two][:, ::-1], span[two])
+        has: dict[str, Sides] = {
+            "axis": (axes[0], sign * axes[1]),
+            "range [rad]": (span[one], mirrored),
+            "standing [rad]": (standing[one], sign * standing[two]),
+            "place [m]": tuple(np.diff(x, axis=0, prepend=0.0) for x in places),
+            "centre of mass [m]": coms,
+        }
+        for quantity, values in scalars.items():
+            has[quantity] = tuple(values[leg].reshape(len(leg), -1) for leg in legs)
+        yield left, right, has
 
 
 def range_words(span: Float[np.ndarray, "2"]) -> str:

@@ -3,10 +3,10 @@
 The knees are bent by 1 rad from the straight leg, or as far as their range allows, because a
 stretched knee is a singularity and heavy legs lift the trunk by 2 to 3 cm. The trunk is upright,
 the soles are level, the centre of mass is above the ankles, or the middle of soles that do not
-reach under them (of four legs each pair of feet is under its hips), and all other angles are as
-small as possible: a least-squares problem in the angles of all legs, solved with MuJoCo's
-kinematics, for any order and direction of the axes. If another joint reaches its limit, the knees
-are bent less.
+reach under them (of four legs each pair of feet is under the axes that swing its legs forwards),
+and all other angles are as small as possible: a least-squares problem in the angles of all legs,
+solved with MuJoCo's kinematics, for any order and direction of the axes, wherever on them the
+anchors are. If another joint reaches its limit, the knees are bent less.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from hector_jax.core.headless import mujoco
 from hector_jax.importing.soles import Sole
-from hector_jax.importing.survey import Survey
+from hector_jax.importing.survey import Survey, hip
 from hector_jax.robot.links import data_at
 
 KNEE = 1.0  # [rad] of the first trial
@@ -59,11 +59,12 @@ def _solve(
 ) -> tuple[Float[np.ndarray, " joints"], bool]:
     """Return the angles of all legs for a knee angle [rad], and whether they are a solution."""
     model, data, joints = survey.model, data_at(survey.model, pose), list(sum(survey.legs, ()))
-    feet = []  # body; axes and point of the sole in its frame
+    feet = []  # body; axes and point of the sole in its frame; joint above it
     for leg, sole in zip(survey.legs, soles, strict=True):
         body = int(model.jnt_bodyid[leg[-1]])
         R, anchor = data.xmat[body].reshape(3, 3), data.xanchor[leg[-1]] - data.xpos[body]
-        feet.append((body, R.T @ sole.axes, R.T @ (anchor + sole.axes @ sole.under)))
+        point = R.T @ (anchor + sole.axes @ sole.under)
+        feet.append((body, R.T @ sole.axes, point, hip(data, leg)))
     address, flat = model.jnt_qposadr[joints], len(soles[0].contacts) > 1
     knees = list(range(survey.knee, len(joints), len(survey.legs[0])))
     low, high = _ranges(model, joints)
@@ -82,15 +83,17 @@ def _solve(
         data.qpos[address] = q
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
-        rotations, foot_x = [], []
-        for body, axes, point in feet:
-            R = data.xmat[body].reshape(3, 3)
+        rotations, foot_x, hip_x = [], [], []
+        for body, axes, point, joint in feet:
+            R, axis, anchor = data.xmat[body].reshape(3, 3), data.xaxis[joint], data.xanchor[joint]
+            foot = data.xpos[body] + R @ point
             rotations.append(Rotation.from_matrix(R @ axes).as_rotvec())
-            foot_x.append((data.xpos[body] + R @ point)[0])
-        pairs = np.reshape(foot_x, (-1, 2)).mean(axis=1)
-        hips = data.xanchor[[leg[0] for leg in survey.legs[::2]], 0]
-        target = data.subtree_com[survey.trunk][:1] if len(pairs) == 1 else hips
-        return np.concatenate(rotations) * flat, target - pairs
+            foot_x.append(foot[0])
+            hip_x.append((anchor + axis @ (foot - anchor) * axis)[0])  # nearest on the axis
+        if len(feet) == 2:
+            hip_x = [data.subtree_com[survey.trunk][0]] * 2
+        offsets = np.reshape(np.subtract(hip_x, foot_x), (-1, 2)).mean(axis=1)
+        return np.concatenate(rotations) * flat, offsets
 
     def residuals(x: Float[np.ndarray, " free"]) -> np.ndarray:
         rotation, offset = errors(x)
@@ -108,6 +111,7 @@ def _ranges(model: mujoco.MjModel, joints: Sequence[int]) -> tuple[np.ndarray, n
     limited = model.jnt_limited[joints].astype(bool)
     low, high = model.jnt_range[joints].T
     margin = np.minimum(_MARGIN, 0.1 * (high - low))
-    # ranges of wheels, and those in degrees, go beyond a turn
+    # ranges of wheels, and those in degrees, go beyond a turn, or are there as a whole
     low, high = np.clip([low + margin, high - margin], -2.0 * np.pi, 2.0 * np.pi)
+    limited &= low < high
     return np.where(limited, low, -np.pi), np.where(limited, high, np.pi)

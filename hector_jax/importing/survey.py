@@ -31,6 +31,12 @@ _MIRROR_TOLERANCE = 0.03  # [m] between a joint and the mirror image of the othe
 _HEIGHT_TOLERANCE = 0.25  # of a leg's height, between the ends of two pairs of legs
 MIN_Y = 0.7  # of the axis of a joint that swings the leg forwards
 _DIRECTIONS = ("roll", "pitch", "yaw")
+_PLACES = {  # words for them in names
+    "front": {"front", "fore", "fl", "fr", "lf", "rf"},
+    "hind": {"hind", "rear", "back", *"hl hr lh rh rl rr lr bl br lb rb".split()},
+    "left": {"left", "l", *"fl lf hl lh rl lr bl lb".split()},
+    "right": {"right", "r", *"fr rf hr rh rr br rb".split()},
+}
 
 
 class Survey(NamedTuple):
@@ -69,9 +75,6 @@ def survey_file(path: Path, named: Sequence[Sequence[str]] = ()) -> Survey:
     legs = legs or _legs(path, data, free)
     trunk = int(model.jnt_bodyid[free[0]] if free else model.body_rootid[_body(model, legs[0][0])])
     others = [j for j in range(model.njnt) if j not in sum(legs, (*free,))]
-    for j in others:
-        text = f"a joint of body {model.body(_body(model, j)).name!r} has no name, expected one: "
-        expect(path, model.joint(j).name, f"{text}it is to be welded")
     knee = _knee(path, data, legs[0])
     knees = [_knee_bend(data, leg, knee) for leg in legs]
     return Survey(
@@ -84,6 +87,27 @@ def survey_file(path: Path, named: Sequence[Sequence[str]] = ()) -> Survey:
         straight=tuple(straight for straight, _ in knees),
         forwards=tuple(ahead for _, ahead in knees[::2]),
     )
+
+
+def places_of(names: Sequence[str]) -> set[str]:
+    """Return which of front, hind, left and right the names of a leg's joints say.
+
+    >>> sorted(places_of(["FL_hip", "FL_hip_r"])), places_of(["upright_knee"])
+    (['front', 'left'], set())
+    """
+    said: set[str] = set()
+    for name in names:
+        parts = " ".join(re.findall("[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)).lower()
+        words = {*re.findall("front|fore|hind|rear|back|left|right|[a-z]+", parts)}
+        places = {place for place, own in _PLACES.items() if words & own}
+        # an "r" may stand for roll, beside a word for the place
+        said |= places - {"left", "right"} if {"left", "right"} <= places else places
+    return said
+
+
+def hip(data: mujoco.MjData, leg: Sequence[int]) -> int:
+    """Return the first joint of a leg that swings it forwards; its first joint if none does."""
+    return next((j for j in leg if abs(data.xaxis[j][1]) >= MIN_Y), leg[0])
 
 
 def axis_words(axis: Float[np.ndarray, "3"]) -> str:
@@ -147,7 +171,7 @@ def _legs(path: Path, data: mujoco.MjData, free: Sequence[int]) -> tuple[tuple[i
             text += "by -90 degrees about z (by 90 if it looks along -y)"
     expect(path, pairs, text)
     low, _, lowest_leg, _ = min(pairs)
-    tolerance, legs = _HEIGHT_TOLERANCE * (data.xanchor[lowest_leg[0]][2] - low), []
+    tolerance, legs = _HEIGHT_TOLERANCE * (data.xanchor[hip(data, lowest_leg)][2] - low), []
     for lowest, _, *pair in sorted(pairs):
         if lowest - low <= tolerance and not set(sum(pair, ())) & set(sum(sum(legs, []), ())):
             legs.append(pair)
@@ -156,7 +180,7 @@ def _legs(path: Path, data: mujoco.MjData, free: Sequence[int]) -> tuple[tuple[i
     text = f"{len(legs)} pairs of chains of {counts} hinges end as low as legs: {ends}; expected "
     text += "one pair, or two of as many hinges"
     expect(path, len(legs) <= 2 and len(set(counts)) == 1, text)
-    legs.sort(key=lambda pair: -data.xanchor[pair[0][0]][0])
+    legs.sort(key=lambda pair: -data.xanchor[hip(data, pair[0])][0])
     for pair in legs:
         if _is_right(data, *pair):
             pair.reverse()
@@ -180,8 +204,7 @@ def _is_right(data: mujoco.MjData, leg: Sequence[int], other: Sequence[int]) -> 
     y = of_leg[1] - of_other[1]
     if abs(y) > 1e-3:
         return bool(y < 0.0)
-    name = data.model.joint(leg[0]).name.lower()
-    return re.search(r"right|(^|_)r(_|$)", name) is not None
+    return "right" in places_of([data.model.joint(leg[0]).name])
 
 
 def _knee(path: Path, data: mujoco.MjData, leg: Sequence[int]) -> int:
@@ -206,11 +229,10 @@ def _knee_bend(data: mujoco.MjData, leg: Sequence[int], knee: int) -> tuple[floa
     Hip, knee and ankle, or the end of a leg without one, are in line when the leg is straight.
     """
     joint = leg[knee]
-    hip = next(j for j in leg if abs(data.xaxis[j][1]) >= MIN_Y)
     ankle = [j for j in leg[knee + 1 :] if abs(data.xaxis[j][1]) >= MIN_Y]
     lowest = min(data.xipos[subtree(data.model, _body(data.model, leg[-1]))], key=lambda p: p[2])
     anchor, end = data.xanchor[joint], data.xanchor[ankle[0]] if ankle else lowest
-    (x, z), (u, w) = (anchor - data.xanchor[hip])[::2], (end - anchor)[::2]
+    (x, z), (u, w) = (anchor - data.xanchor[hip(data, leg)])[::2], (end - anchor)[::2]
     sign = float(np.sign(data.xaxis[joint][1]))
     straight = sign * float(np.arctan2(x * w - z * u, x * u + z * w))
     return straight, bool(sign * (data.model.jnt_range[joint].sum() - 2.0 * straight) > 1e-6)

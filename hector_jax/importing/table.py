@@ -10,7 +10,7 @@ from hector_jax.importing.remarks import numbers, pairs_of, range_words, words_o
 from hector_jax.importing.survey import axis_words
 from hector_jax.robot.checks import standing_data, trunk_body
 from hector_jax.robot.kinematics import knee_joints
-from hector_jax.robot.model import Robot, build_model
+from hector_jax.robot.model import Robot, build_model, quiet_mujoco
 from hector_jax.robot.source import build_spec
 
 _COLUMNS = {
@@ -23,6 +23,7 @@ _COLUMNS = {
 _WIDTH = 91  # of the names of a line
 
 
+@quiet_mujoco()
 def table_of(robot: Robot) -> list[str]:
     """Return the table of a robot, line by line."""
     description, model = robot.description, build_model(robot.description, checked=False)[1]

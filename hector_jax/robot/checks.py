@@ -101,14 +101,10 @@ def _check_standing(description: Description, model: mujoco.MjModel) -> None:
         text += "floor, expected nothing there but soles: change the standing angles or the shape"
         expect(path, sole or bodies.min() or contact.dist > -ON_FLOOR, text)
     x, y, _ = np.array([data.site(foot.point).xpos for foot in feet]).T
-    for left in range(0, len(feet), 2):
-        text = f"{key} has the {legs[left]} foot at y = {y[left]:.4g}, expected it left of the "
-        text += f"{legs[left + 1]} one, at {y[left + 1]:.4g}"
-        expect(path, y[left] > y[left + 1], text)
-    for front in range(len(feet) - 2):
-        text = f"{key} has the {legs[front]} foot at x = {x[front]:.4g}, expected it ahead of the "
-        text += f"{legs[front + 2]} one, at {x[front + 2]:.4g}"
-        expect(path, x[front] > x[front + 2], text)
+    pairs = [(i, i + 1, "y", y, "left") for i in range(0, len(feet), 2)]
+    for i, j, axis, at, word in pairs + [(i, i + 2, "x", x, "ahead") for i in range(len(feet) - 2)]:
+        text = f"{key} has the {legs[i]} foot at {axis} = {at[i]:.4g}, expected it {word} of the "
+        expect(path, at[i] > at[j], f"{text}{legs[j]} one, at {at[j]:.4g}")
     com = data.subtree_com[trunk_body(model)][:2]
     contacts = np.array([data.geom(name).xpos[:2] for name in spheres])
     low, high = contacts.min(axis=0), contacts.max(axis=0)
@@ -121,7 +117,7 @@ def _check_standing(description: Description, model: mujoco.MjModel) -> None:
 def _check_load(description: Description, data: mujoco.MjData) -> None:
     """Check that each motor can hold its joint in the standing pose, the feet sharing the load."""
     model, trunk, feet = data.model, trunk_body(data.model), description.named_feet
-    com, torques = data.subtree_com[trunk], data.qfrc_bias.copy()
+    com, torques = data.subtree_com[trunk], data.qfrc_bias - data.qfrc_passive  # of springs
     force = -model.opt.gravity * model.body_subtreemass[trunk] / len(feet)
     for foot in feet:
         site = data.site(foot.point)

@@ -5,6 +5,8 @@ never opened. A body whose mass comes from a mesh, and a coupling of leg joints,
 
 CAD programs export frames of no mass, whose inertia is rounding: a body of at most MASSLESS has
 none, and a heavier one that is fixed to its parent is a point mass if no body can have its inertia.
+
+Bodies and joints without a name get one, by which descriptions and messages mean them.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -15,16 +17,15 @@ import numpy as np
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import short_repr
-from hector_jax.robot.checks import expect
+from hector_jax.robot.checks import expect, listed
 from hector_jax.robot.links import MASSLESS
-from hector_jax.robot.mjcf import mujoco_errors
+from hector_jax.robot.mjcf import mujoco_errors, text_of
 
 _GEOM = mujoco.mjtGeom
 _MESHES = (_GEOM.mjGEOM_MESH, _GEOM.mjGEOM_SDF, _GEOM.mjGEOM_HFIELD)
 _NO_INERTIA = 1e-12  # [kg m^2], which MuJoCo accepts of any body
 _COUPLINGS = ("equality", "tendon")
 _UNUSED = (*_COUPLINGS, "sensor", "deformable", "custom")
-_LINK_PARTS = ("inertial", "visual", "collision")
 _JOINT_PARTS = ("parent", "child", "origin", "axis", "limit", "dynamics")
 
 
@@ -70,7 +71,8 @@ def spec_of(
                 for name in ("ctrl", "act", "mpos", "mquat"):  # their lengths may change
                     key.attrib.pop(name, None)
     with mujoco_errors(path, root):
-        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+        spec = mujoco.MjSpec.from_string(text_of(root))
+    _add_names(spec)
     removed += _remove_meshes(path, spec)
     _mend_inertias(path, spec)
     return spec, [*notes, *[f"{removed} meshes and pictures are not read"] * bool(removed)]
@@ -79,6 +81,18 @@ def spec_of(
 def _remove(parent: ElementTree.Element, children: Sequence[ElementTree.Element]) -> None:
     for child in children:
         parent.remove(child)
+
+
+def _add_names(spec: mujoco.MjSpec) -> None:
+    """Name each body and each joint that has no name; a free joint needs none."""
+    joints = [joint for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
+    for kind, parts in (("body", spec.bodies[1:]), ("joint", joints)):
+        names = {part.name for part in parts}
+        for i, part in enumerate(parts, 1):
+            name = f"{kind}_{i}"
+            while not part.name and name in names:
+                name += "_"
+            part.name = part.name or name
 
 
 def _mend_inertias(path: Path, spec: mujoco.MjSpec) -> None:
@@ -148,6 +162,7 @@ def _check_couplings(path: Path, root: ElementTree.Element, joints: Sequence[str
 def _clean_urdf(path: Path, root: ElementTree.Element, joints: Sequence[str]) -> int:
     """Keep links of numbers and primitives, and free joints. Returns the number of meshes."""
     removed = 0
+    _check_tree(path, root)
     for joint in root.findall("joint"):
         name = joint.get("name")
         mimics = joint.find("mimic") is not None and name in joints
@@ -157,14 +172,11 @@ def _clean_urdf(path: Path, root: ElementTree.Element, joints: Sequence[str]) ->
         meshes = [part for part in link if part.find(".//mesh") is not None]
         removed += len(meshes)
         _remove(link, meshes)
-        _remove(link, [part for part in link if part.tag not in _LINK_PARTS])
         for part in link.findall("inertial"):
             mass = part.find("mass")
             # `read_mjcf` found numbers in it; MuJoCo refuses more than one
             if mass is None or float(mass.get("value", "0").split()[0]) == 0.0:
                 link.remove(part)
-    for material in root.iter("material"):
-        _remove(material, material.findall("texture"))
     # the root link stays a body, and a link without <inertial> has no mass
     flags = {"fusestatic": "false", "discardvisual": "false", "inertiafromgeom": "false"}
     own = {name: x for part in root.findall("mujoco/compiler") for name, x in part.attrib.items()}
@@ -173,3 +185,26 @@ def _clean_urdf(path: Path, root: ElementTree.Element, joints: Sequence[str]) ->
     ElementTree.SubElement(options, "compiler", own | flags)
     root.insert(0, options)
     return removed
+
+
+def _check_tree(path: Path, root: ElementTree.Element) -> None:
+    """Refuse a URDF whose links and joints are no tree: MuJoCo drops a link that nothing holds."""
+    links, joints = ([x.get("name", "") for x in root.findall(tag)] for tag in ("link", "joint"))
+    twice = {x for names in (links, joints) for x in names if not x or names.count(x) > 1}
+    text = f"names of links and of joints must differ, got {sorted(twice)} empty or twice"
+    expect(path, not twice, text)
+    above: dict[str, str] = {}
+    for joint in root.findall("joint"):
+        ends = [x.get("link", "") for tag in ("parent", "child") for x in joint.findall(tag)]
+        text = f"joint {joint.get('name')!r} joins {ends}, expected its parent and child, two links"
+        expect(path, len(ends) == 2 and {*ends} <= {*links}, text)
+        expect(path, ends[1] not in above, f"{text}, and no other joint to have this child")
+        above[ends[1]] = ends[0]
+    tops = list(links)
+    for _ in links:
+        tops = [above.get(top, top) for top in tops]
+    ring = [link for link, top in zip(links, tops, strict=True) if top in above]
+    expect(path, not ring, f"links {listed(ring)} hang in a ring, expected one tree")
+    roots = sorted({*tops}, key=tops.count)  # that of the robot is last
+    text = f"no joint holds {listed(roots[:-1])}, expected one tree below {listed(roots[-1:])}"
+    expect(path, len(roots) < 2, text)

@@ -3,14 +3,16 @@
 A model is one self-contained MJCF or URDF file of at most 1 MB: meshes and pictures are named in it
 but never opened (`elements` removes them). Elements that read other files (includes) or expand
 (entities, replicated and composed bodies, huge textures and memories) and numbers that no robot has
-(NaN, negative masses, empty ranges) are refused; the message names file, element, attribute and
-value. Other modules check which bodies and joints a robot has.
+(NaN, negative masses, empty ranges, turns in degrees where radians are due) are refused; the
+message names file, element, attribute and value. What a URDF draws only (visuals) is left out.
+Other modules check which bodies and joints a robot has.
 """
 
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from itertools import product
 from pathlib import Path
 
 from hector_jax.core.headless import mujoco
@@ -22,7 +24,9 @@ TIME_STEP = 0.001  # [s] of plant, joint control and samples of every robot
 MOST_BYTES = 1_000_000
 _DEEPEST = 100
 _MOST_BODIES, _MOST_JOINTS = 2000, 200
-_URDF_PARTS = ("link", "joint", "material", "mujoco")  # of a robot; others are for other programs
+_URDF_PARTS = ("link", "joint", "mujoco")  # of a robot; others are for other programs
+_LINK_PARTS = ("inertial", "collision")
+_TURN = 6.3  # [rad], rounded up
 _REFUSED = ("include", "attach", "model", "replicate", "composite", "flexcomp", "plugin")
 
 _COUNT = Range(-1, 1_000_000)  # -1: as many as needed
@@ -43,6 +47,9 @@ _RANGES_OF = {
     ("inertial", "mass"): POSITIVE,
     ("numeric", "size"): _COUNT,
     ("mass", "value"): NOT_NEGATIVE,
+    # of a URDF's shapes, which have no names
+    ("box", "size"): POSITIVE,
+    **dict.fromkeys(product(("sphere", "cylinder", "capsule"), ("radius", "length")), POSITIVE),
 }
 _PAIRS = ("range", "ctrlrange", "forcerange", "actuatorfrcrange")
 _MEMORY = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30}
@@ -66,6 +73,9 @@ def read_mjcf(path: Path) -> ElementTree.Element:
         raise InputError(f"{path}: root element is <{root.tag[:40]}>, expected <mujoco> or <robot>")
     if root.tag == "robot":
         root[:] = [part for part in root if part.tag in _URDF_PARTS]
+        for link in root.findall("link"):
+            link[:] = [part for part in link if part.tag in _LINK_PARTS]
+    in_rad = root.tag == "robot" or any(x.get("angle") == "radian" for x in root.iter("compiler"))
     bodies = joints = 0
     for element, label in _labelled(path, root):
         file = f" of {short_repr(element.get('file'))}" if "file" in element.attrib else ""
@@ -74,7 +84,7 @@ def read_mjcf(path: Path) -> ElementTree.Element:
         bodies += element.tag in ("body", "link")
         joints += element.tag in ("joint", "freejoint") and element.get("type") != "fixed"
         for name, value in element.attrib.items():
-            if expected := _expected(element.tag, name, value):
+            if expected := _expected(element.tag, name, value, in_rad):
                 message = f"{name} is {short_repr(value)}, expected {expected}"
                 raise InputError(f"{path}: {label}: {message}")
     expect(path, bodies <= _MOST_BODIES, f"{bodies} bodies, expected at most {_MOST_BODIES}")
@@ -84,48 +94,54 @@ def read_mjcf(path: Path) -> ElementTree.Element:
 
 
 @contextmanager
-def mujoco_errors(path: Path, root: ElementTree.Element | None = None) -> Iterator[None]:
-    """Raise MuJoCo's errors as one-line InputErrors.
+def mujoco_errors(path: Path, root: ElementTree.Element) -> Iterator[None]:
+    """Raise MuJoCo's errors as one-line InputErrors, with the name nearest to an unknown one.
 
     Args:
         path: of the file, for the message.
-        root: XML element of the file; if passed, the message suggests the name nearest to an
-            unknown one.
+        root: of which MuJoCo reads `text_of`.
     """
     try:
         yield
     except (ValueError, mujoco.FatalError) as error:
-        message, hint = one_line(error), ""
-        if root is not None:
-            schema = re.findall(r"\w+", mujoco.mj_printSchema(False, False))
-            names = {element.get("name", "") for element in root.iter()} | set(schema)
-            # MuJoCo quotes unknown names and their context: the first word without a match counts
-            unknown = [word for word in re.findall(r"'([^']*)'", message) if word not in names]
-            hint = did_you_mean(unknown[0], names) if unknown else ""
-            if "balanceinertia" in message:
-                hint = ': write <compiler balanceinertia="true"/> into <mujoco>, in a URDF too'
+        labels, message = [label for _, label in _labelled(path, root)], one_line(error)
+        schema = re.findall(r"\w+", mujoco.mj_printSchema(False, False))
+        names = {element.get("name", "") for element in root.iter()} | set(schema)
+        # MuJoCo quotes unknown names and their context: the first word without a match counts
+        unknown = [word for word in re.findall(r"'([^']*)'", message) if word not in names]
+        hint = did_you_mean(unknown[0], names) if unknown else ""
+        if "balanceinertia" in message:
+            hint = ': write <compiler balanceinertia="true"/> into <mujoco>, in a URDF too'
+        # the lines are those of `text_of`, and not the user's
+        place = r"Element (?:name )?'[^']*'(?:, id \d+)?, line (\d+)"
+        message = re.sub(place, lambda match: f"at {labels[int(match[1]) - 1]}", message)
         raise InputError(f"{path}: MuJoCo refuses it: {message}{hint}") from None
 
 
-def _labelled(path: Path, root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str]]:
-    """Yield each element with its label for messages."""
-    depth = {root: 1}
-    yield root, f"<{root.tag}>"
+def text_of(root: ElementTree.Element) -> str:
+    """Return the text of a file's elements, in which each one begins a line."""
     for parent in root.iter():
-        expect(path, depth[parent] <= _DEEPEST, f"elements are nested deeper than {_DEEPEST}")
+        parent.text = "\n" * bool(len(parent))
         for child in parent:
-            depth[child] = depth[parent] + 1
-            label = f"<{child.tag}>"
-            if name := child.get("name"):
-                label += f" {short_repr(name)}"
-            elif owner := parent.get("name") or parent.get("class"):
-                label += f" of {short_repr(owner)}"
-            yield child, label
+            child.tail = "\n" * (child is not parent[-1])
+    return ElementTree.tostring(root, encoding="unicode")
 
 
-def _expected(tag: str, name: str, value: str) -> str | None:
+def _labelled(
+    path: Path, element: ElementTree.Element, owner: str = "", depth: int = 1
+) -> Iterator[tuple[ElementTree.Element, str]]:
+    """Yield each element in their order with its label: its own name or that of an outer one."""
+    expect(path, depth <= _DEEPEST, f"elements are nested deeper than {_DEEPEST}")
+    name = element.get("name")
+    label = f" {short_repr(name)}" if name else f" of {short_repr(owner)}" * bool(owner)
+    yield element, f"<{element.tag}>{label}"
+    for child in element:
+        yield from _labelled(path, child, name or element.get("class") or owner, depth + 1)
+
+
+def _expected(tag: str, name: str, value: str, in_rad: bool) -> str | None:
     """Return what was expected of an attribute with an invalid value, None for a valid one."""
-    if name == "name":
+    if name == "name" or tag == "flag":  # a flag's attributes are words, as "enable"
         return None
     numbers = _numbers(value)
     if name == "memory":
@@ -137,6 +153,8 @@ def _expected(tag: str, name: str, value: str) -> str | None:
         return f"numbers {allowed}"
     if numbers and not all(number in Range() for number in numbers):
         return "finite numbers"
+    if name in ("rpy", "euler") and in_rad and max(map(abs, numbers or [0.0])) > _TURN:
+        return "rad, and these are degrees"
     pair = name in _PAIRS and tag != "light"  # the range of a light is a length
     if pair and (numbers is None or len(numbers) != 2 or numbers[0] > numbers[1]):
         return "two numbers, the lower one first"

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
+from warnings import catch_warnings
 
 import jax
 import numpy as np
@@ -18,11 +19,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import InputError
+from hector_jax.core.inputs import InputError, one_line
 from hector_jax.robot.checks import check_model, check_soles, standing_data, trunk_body
 from hector_jax.robot.description import DESCRIPTION_PATH, Description, read_description
 from hector_jax.robot.links import data_at, inertia_about
-from hector_jax.robot.mjcf import mujoco_errors
 from hector_jax.robot.source import build_spec
 
 _CLOSED_AXES = np.eye(3)[[2, 0, 1, 1, 1]]  # yaw, roll, hip pitch, knee, ankle
@@ -42,6 +42,19 @@ def quiet_mujoco() -> Iterator[None]:
         yield
     finally:
         mujoco.set_mju_user_warning(before)
+
+
+@contextmanager
+def conversion(path: Path) -> Iterator[None]:
+    """Raise as an InputError whatever MuJoCo, SciPy or a name raises while a file is converted."""
+    try:
+        with quiet_mujoco(), catch_warnings(action="ignore", category=UserWarning):
+            yield
+    except InputError:
+        raise
+    except (ArithmeticError, LookupError, ValueError, mujoco.FatalError) as error:
+        text = f"{path}: no robot can be made of it: {type(error).__name__}: {one_line(error)}"
+        raise InputError(text) from error
 
 
 @jax.tree_util.register_static
@@ -117,7 +130,6 @@ def load_robot(path: Path | None = None) -> Robot:
         raise InputError(text) from None
 
 
-@quiet_mujoco()
 def robot_of(description: Description, *, checked: bool = True) -> Robot:
     """Compile the robot of a description and read its constants.
 
@@ -125,6 +137,11 @@ def robot_of(description: Description, *, checked: bool = True) -> Robot:
         InputError: as `build_model`.
     """
     model = build_model(description, checked=checked)[1]
+    with conversion(description.model):
+        return _constants(description, model, checked)
+
+
+def _constants(description: Description, model: mujoco.MjModel, checked: bool) -> Robot:
     data = standing_data(description, model)
     trunk = trunk_body(model)
     R_wb = data.xmat[trunk].reshape(3, 3)
@@ -171,7 +188,6 @@ def compile_model(description: Description) -> mujoco.MjModel:
     return build_model(description)[1]
 
 
-@quiet_mujoco()
 def build_model(
     description: Description, *, checked: bool = True
 ) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
@@ -181,11 +197,11 @@ def build_model(
         InputError: one line with the value received, the expected one and the possible names, from
             `source.build_spec` or `checks.check_model`.
     """
-    spec = build_spec(description).spec
-    with mujoco_errors(description.model):
+    with conversion(description.model):
+        spec = build_spec(description).spec
         model = spec.compile()
-    if checked:
-        check_model(description, model)
+        if checked:
+            check_model(description, model)
     return spec, model
 
 

@@ -8,7 +8,8 @@ Contact bits: 1 floor, 2 first leg, 4 second leg, and so on. Soles touch the flo
 spheres only; trunk and legs collide with the floor, so that falls are detected, and the legs with
 each other, except links of which the file excludes all bodies. Friction and stiffness are those of
 the floor. A sphere, a cylinder or an ellipsoid that collides becomes a capsule of its length and
-radius, or the largest box in it if it is a disc. A body without geoms is drawn as a stick.
+radius, or the largest box in it if it is a disc. A body without geoms is drawn as a stick. Of the
+file's geoms only the spheres of soles keep their names, and a part of ours has none that is taken.
 """
 
 from collections.abc import Sequence
@@ -83,10 +84,14 @@ def rebuild(description: Description, pieces: Pieces) -> mujoco.MjSpec:
         setattr(spec.option, name, value)
     spec.option.gravity = pieces.model.opt.gravity
     named = {str(name) for foot in description.feet if foot.body is None for name in foot.contacts}
+    if "floor" in named:
+        spec.geom("floor").name = ""
     bodies = []
     for link in pieces.links:
         bodies.append(_add_link(bodies[link.parent] if bodies else spec.worldbody, pieces, link))
         _add_geoms(description, pieces, len(bodies) - 1, bodies[-1], named)
+    if "base" not in description.joints:
+        bodies[0].joints[0].name = "base"
     for joint, limit in zip(description.joints, pieces.limits, strict=True):
         span = [-limit, limit]
         limits = {"ctrllimited": True, "ctrlrange": span, "forcelimited": True, "forcerange": span}
@@ -112,7 +117,7 @@ def _add_link(parent: mujoco.MjsBody, pieces: Pieces, link: Link) -> mujoco.MjsB
         explicitinertial=True,
     )
     if j < 0:
-        body.add_freejoint(name="base")
+        body.add_freejoint()
         return body
     dof = model.jnt_dofadr[j]
     body.add_joint(
@@ -158,6 +163,7 @@ def _add_geoms(
         name, material = model.geom(g).name, int(model.geom_matid[g])
         rgba = np.array(model.mat_rgba[material] if material >= 0 else model.geom_rgba[g])
         fields: dict = {"group": int(model.geom_group[g]), "rgba": rgba, **_TOUCHES_NOTHING}
+        fields["mass"] = 0.0
         if name in named:
             fields |= {**_ROBOT_GEOM, **_FLOOR_BITS}
         elif collide[g]:
@@ -166,7 +172,7 @@ def _add_geoms(
             if collide[geoms].all():  # nothing else is drawn
                 fields |= {"group": 2, "rgba": [*rgba[:3], 1.0]}
         body.add_geom(
-            name=name, type=shape, size=size, pos=pose.p, quat=pose.quat, mass=0.0, **fields
+            name=name * (name in named), type=shape, size=size, pos=pose.p, quat=pose.quat, **fields
         )
 
 
@@ -272,8 +278,6 @@ def _add_foot_by_points(
         _add_stick(body, contacts.mean(axis=0) + up, contact + up, CONTACT_RADIUS)
     fields = {"mass": 0.0, "group": 2, "rgba": _DARK, **_ROBOT_GEOM, **_FLOOR_BITS}
     for name, contact in zip(names.contacts, contacts, strict=True):
-        if duplicate := spec.geom(name):
-            duplicate.name = ""
         size = [CONTACT_RADIUS, 0.0, 0.0]
         body.add_geom(name=name, type=_SPHERE, size=size, pos=contact + up, **fields)
     own = foot.point is not None

@@ -28,6 +28,7 @@ _JOINT = mujoco.mjtJoint
 _MOTOR = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE
 _LISTED = 12  # bodies
 _ENDLESS = 4.0 * np.pi  # [rad] of a range
+UNITS = 'rad in a URDF, degrees in an MJCF without <compiler angle="radian"/>'
 _MAX_FRICTION = 0.2  # of the robot's geoms; MuJoCo takes the larger friction of two geoms
 
 
@@ -138,9 +139,11 @@ def _check_joints(file: _File) -> None:
         if not model.jnt_limited[j] or np.ptp(model.jnt_range[j]) > _ENDLESS
     ]
     last = description.joints[description.leg_joints - 1 :: description.leg_joints]
+    limited = [name for name in endless if model.jnt_limited[model.joint(name).id]]
     text = f"joints {listed(endless)} turn without end, as wheels do, expected feet: fix them"
+    text += f"; or the ranges of {listed(limited)} have another unit: {UNITS}" * bool(limited)
     expect(path, not endless or not set(endless) <= set(last), text)
-    without = [name for name in endless if not model.jnt_limited[model.joint(name).id]]
+    without = [name for name in endless if name not in limited]
     text = f"joint {_nor(without)}, expected limits (in a URDF: revolute, lower and upper)"
     expect(path, not without, text.format("range"))
     for j in file.joints:
@@ -254,6 +257,9 @@ def _changes(file: _File, limits: Sequence[float], links: Sequence[Link]) -> lis
     """Return one line per reason to rebuild a robot; none if it has the standard form."""
     description, model = file.description, file.model
     inside = [b for b in range(1, model.nbody) if model.body_rootid[b] == file.trunk]
+    beside = [
+        model.body(b).name for b in {*range(1, model.nbody)} - {*inside} if model.body_mass[b]
+    ]
     static = [model.body(b).name for b in inside if not model.body_jntnum[b] and b != file.trunk]
     more = f" and {len(static) - _LISTED} more" if len(static) > _LISTED else ""
     order = [file.free, *file.joints] == list(range(model.njnt))
@@ -264,6 +270,7 @@ def _changes(file: _File, limits: Sequence[float], links: Sequence[Link]) -> lis
         ("free joint added to the trunk", file.free < 0),
         (f"fixed: {listed(description.weld)}", description.weld),
         (f"made one with their parents: {listed(static[:_LISTED])}{more}", static),
+        (f"left out, which no joint holds: {listed(beside)}", beside),
         ("joints put in order, leg by leg", file.free >= 0 and not (order or description.weld)),
         ("frames of the joints put into their anchors", not at_origin and order),
         (f"torque motors {motors}", not _motors_match(file, limits)),
