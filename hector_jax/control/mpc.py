@@ -60,6 +60,10 @@ class MpcParameters(NamedTuple):
     integral: IntegralGains
 
 
+class _Default(tuple):
+    """Constraints that nobody has named: those of the contact model, also after `replace`."""
+
+
 @dataclass(frozen=True)
 class MpcConfig:
     """Static configuration of the MPC, and the defaults of its numbers."""
@@ -91,7 +95,8 @@ class MpcConfig:
         check(self, position_limit=POSITIVE, effort_reference=words, inertia_share=share)
         if len(got := self.inertia_share) != 3:
             raise InputError(f"MpcConfig.inertia_share must be 3 numbers, got {short_repr(got)}")
-        object.__setattr__(self, "constraints", self.constraints or self.contact.constraints)
+        if not self.constraints or isinstance(self.constraints, _Default):
+            object.__setattr__(self, "constraints", _Default(self.contact.constraints))
         if not self.on("inputs"):
             text = "MpcConfig.constraints must have one on the inputs, or feet can pull"
             raise InputError(f"{text}, got {self.constraints}")
