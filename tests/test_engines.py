@@ -15,6 +15,7 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.headless import mujoco
 from hector_jax.robot.model import load_robot
+from hector_jax.sim.actuators import init_actuators, step_actuators
 from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
@@ -92,6 +93,20 @@ def test_the_mass_matrix_is_that_of_mujoco(engine, file, backlash, close):
         else:
             turn[3:6, 3:6] = R.reshape(3, 3).T
         np.testing.assert_allclose(theirs, turn.T @ ours @ turn, atol=close * np.abs(ours).max())
+
+
+def test_no_joint_gets_more_than_its_limit_through_the_linkage_either():
+    """MuJoCo's actuators limit the sum; the other engines apply what `step_actuators` returns."""
+    plant = ideal()._replace(linkage=np.array(0.5))
+    limit = HECTOR.torque_limit
+    np.testing.assert_array_equal(
+        build_world(plant, HECTOR.description).model.actuator_ctrlrange[:, 1], limit
+    )
+    for sign in (1.0, -1.0):
+        _, torque = step_actuators(HECTOR, plant, init_actuators(10), sign * 1e3 * np.ones(10))
+        np.testing.assert_allclose(torque, sign * limit)
+    _, torque = step_actuators(HECTOR, plant, init_actuators(10), np.ones(10))
+    assert torque[3] == pytest.approx(1.5)  # the knee, and half of the ankle
 
 
 @pytest.mark.parametrize("plant", WORLDS)

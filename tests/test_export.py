@@ -6,6 +6,7 @@ import io
 import json
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -35,12 +36,21 @@ from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.reference import Command, named_command
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights
+from hector_jax.core.console import Broken
+from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import to_table
 from hector_jax.core.trajectory import State, pack_wrench
 from hector_jax.export import check, export
-from hector_jax.export.check import Library, compare_with_live, compile_controller, inputs_of
+from hector_jax.export.check import (
+    Inputs,
+    Library,
+    compare_with_live,
+    compile_controller,
+    inputs_of,
+)
 from hector_jax.export.export import SCHEMA, controller_of_run, find_weights, weights_cpp
 from hector_jax.export.source import controller_source
+from hector_jax.export.template import fill_template
 from hector_jax.qp import QP, Status, solve_qp
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.loop import Job
@@ -318,6 +328,94 @@ def test_no_pieces_and_huge_numbers_are_bad_inputs_too(library, walked):
     np.testing.assert_allclose(out["torque"][16:], walked.torque[16:], atol=1.0)
 
 
+@pytest.mark.parametrize(
+    ("part", "name", "value"),
+    [
+        ("command", "duration", 6.9e-310),  # what memory that nobody filled in holds
+        ("command", "duration", 1e7),
+        ("command", "velocity", 1e308),
+        ("command", "velocity", 1e7),
+        ("command", "yaw_rate", -1e7),
+        ("anchor", "position", np.nan),
+        ("anchor", "position", 1e100),
+        ("anchor", "yaw", 6e15),
+        ("estimate", "joint_rates", np.inf),
+    ],
+)
+def test_a_refused_call_leaves_all_but_the_time_as_it_was(library, walked, part, name, value):
+    bad, seen = 1240, []
+    inputs = Inputs(*(np.resize(rows, len(walked.torque)) for rows in inputs_of(walked, ROBOT)))
+    getattr(inputs, part)[name][bad] = value
+
+    def look(i, compiled):
+        if i in (bad, bad + 1):
+            seen.append(np.frombuffer(compiled.memory.raw, "u8"))
+
+    out = answers(library, inputs, look)
+    assert np.flatnonzero(out["status"]).tolist() == [bad]
+    (changed,) = np.flatnonzero(seen[0] != seen[1])  # the count of milliseconds
+    assert seen[1][changed] == seen[0][changed] + 1
+    np.testing.assert_allclose(out["torque"][bad + 1 :], walked.torque[bad + 1 :], atol=1.0)
+
+
+@pytest.mark.parametrize("flag", ["-ffast-math", "-Ofast"])
+def test_a_compiler_that_takes_no_number_for_nan_is_refused(flag, tmp_path):
+    needs_cc()
+    with pytest.raises(Broken, match="remove the checks for NaN"):
+        compile_controller(source_of(TUNED), tmp_path, flag)
+
+
+OWN_Q = """#include "controller.h"
+double WHOSE(void) {
+    static struct controller c;
+    controller_init(&c);
+    return c.next.Q[0] == controller_exported.Q[0] ? c.next.Q[0] : -1.0;
+}
+"""
+BOTH = """#include <stdio.h>
+double a(void), b(void);
+int main(void) { return printf("%.17g %.17g", a(), b()) < 0; }
+"""
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_two_exports_in_one_program_keep_their_numbers(tmp_path, shared):
+    needs_cc()
+    both = {"a": TUNED, "b": CONFIG.with_others(nominal(), OTHERS)}
+    (tmp_path / "main.c").write_text(BOTH)
+    linked = []
+    for name, weights in both.items():
+        (folder := tmp_path / name).mkdir()
+        for file, text in {**source_of(weights), "own.c": OWN_Q}.items():
+            (folder / file).write_text(text)
+        words = f"cc -std=c99 -fPIC -DWHOSE={name}"
+        if shared:
+            linked.append(f"{name}/own.so")
+            words += " -shared own.c controller.c -lm -o own.so"
+        else:
+            linked += [f"{name}/own.o", f"{name}/controller.o"]
+            words += " -c own.c controller.c"
+        subprocess.run(words.split(), cwd=folder, check=True)
+    words = ["cc", "main.c", *linked, "-Wl,-rpath,.", "-lm", "-o", "main"]
+    subprocess.run(words, cwd=tmp_path, check=True)
+    said = subprocess.run(["./main"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    found = [float(x) for x in said.stdout.split()]
+    assert found == [float(weights.Q.euler[0]) for weights in both.values()]
+
+
+def test_a_program_in_cpp_links_with_the_controller(library):
+    if shutil.which("c++") is None:
+        pytest.skip("there is no C++ compiler")
+    code = """#include "controller.h"
+    static controller c;
+    int main() { controller_init(&c); return controller_exported.Q[0] <= 0.0; }
+    """
+    (library.parent / "use.cpp").write_text(code)
+    words = "c++ use.cpp controller.so -Wl,-rpath,. -o use".split()
+    subprocess.run(words, cwd=library.parent, check=True)
+    assert subprocess.run(["./use"], cwd=library.parent).returncode == 0
+
+
 def exported_numbers(functions):
     """A copy of the struct of tunables: Q, R, scalars, kp and kd."""
     kind = ctypes.c_double * (24 + len(TUNABLES) - 2 + 10)
@@ -535,3 +633,41 @@ def test_a_set_that_is_not_there_is_one_line_and_writes_nothing(monkeypatch, cap
     assert call(monkeypatch, run, "--set", "bset") == 2
     assert re.match("hector: .*did you mean 'best'", capsys.readouterr().err.splitlines()[-1])
     assert not (run / "export").exists()
+
+
+# A template
+
+
+def filled(folder, text):
+    (folder / "gains.j2").write_bytes(text.encode())
+    return fill_template(folder / "gains.j2", nominal())
+
+
+@pytest.mark.parametrize(
+    "text", ["a\r\nb {{ Q.euler[0] }}\r\n", "a\nb {{ Q.euler[0] }}\n", "{{ 3 }}"]
+)
+def test_a_filled_template_has_the_line_ends_of_its_file(tmp_path, text):
+    number = str(float(nominal().Q.euler[0]))
+    assert filled(tmp_path, text) == text.replace("{{ Q.euler[0] }}", number).replace(
+        "{{ 3 }}", "3"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("{{ 1/0 }}", "division by zero"),
+        ("{{ Q.yaw[0] }}", "no attribute 'yaw'"),
+        ("{{ Q.euler[0] + friction }}", "'friction' is undefined"),
+        ("{% macro f() %}{{ f() }}{% endmacro %}{{ f() }}", "recursion"),
+        ('{{ cycler.__init__.__globals__.os.popen("touch ran") }}', "unsafe"),
+        ("double a[]{{1, 2, 3}};", r"a number or text, got \(1, 2, 3\)"),
+        ("{{ Q.euler }}", "a number or text, got"),
+    ],
+)
+def test_what_a_template_cannot_print_is_told_in_one_line(tmp_path, monkeypatch, text, told):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=told) as found:
+        filled(tmp_path, text)
+    assert len(str(found.value).splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["gains.j2"]

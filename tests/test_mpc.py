@@ -12,6 +12,7 @@ import scipy.linalg
 from oracles import exact_solution, pack_state
 
 from hector_jax.control.contact import (
+    FLAT_FOOT,
     FRICTION,
     LINE_FOOT,
     LINE_FRICTION,
@@ -307,6 +308,15 @@ def test_constraints_are_chosen_by_name_and_none_are_those_of_the_contact_model(
     assert pickle.loads(pickle.dumps(CONFIG)) == CONFIG
     assert [str(one) for one in MpcConfig(line_friction=False).on("inputs")] == names[:3]
     assert replace(MpcConfig(line_friction=False), line_friction=True) == MpcConfig()
+
+
+def test_a_config_with_another_contact_model_has_the_constraints_of_that_one():
+    flat = replace(MpcConfig(), contact=FLAT_FOOT)
+    assert (flat, flat.constraints) == (MpcConfig(contact=FLAT_FOOT), FLAT_FOOT.constraints)
+    assert replace(flat, contact=LINE_FOOT, friction=0.5) == MpcConfig(friction=0.5)
+    assert replace(pickle.loads(pickle.dumps(CONFIG)), contact=FLAT_FOOT) == flat
+    named = MpcConfig(constraints=(FRICTION,))
+    assert replace(named, contact=FLAT_FOOT).constraints == (FRICTION,)
 
 
 def standing():

@@ -724,3 +724,55 @@ def test_a_curvature_counts_however_large_the_others_are(small, large):
         found = solve(rows(P=np.diag(diagonal), q=(-1.0, -1.0)))
         check_solved(found)
         np.testing.assert_allclose(found.x, 1.0 / np.array(diagonal), rtol=1e-12)
+
+
+def knee(p):
+    """1 / p, as the minimiser of p x^2 / 2 - x."""
+    one = jnp.ones(1)
+    return solve_qp(QP(p * jnp.eye(1), -one, jnp.ones((1, 1)), -9.0 * one, 9.0 * one)).x[0]
+
+
+def twice(p):
+    """The same in a loop, as a walk is one."""
+    return jax.lax.scan(lambda x, _: (knee(x), None), p, None, length=2)[0]
+
+
+@pytest.mark.parametrize("of", [knee, twice])
+def test_a_second_derivative_is_refused_and_not_zero(of):
+    sound, two = -0.25 if of is knee else 1.0, jnp.array([2.0, 2.0])
+    for first in (jax.grad(of), jax.jacfwd(of), jax.grad(jax.checkpoint(of))):
+        np.testing.assert_allclose(jax.jit(jax.vmap(first))(two), sound, rtol=1e-9)
+        for second in (jax.grad(first), jax.jacfwd(jax.jit(first))):
+            with pytest.raises(NotImplementedError, match="first derivative only"):
+                second(2.0)
+    other = jax.grad(lambda p: jax.grad(lambda t: t**2 * of(p))(3.0))  # of the QP but once
+    np.testing.assert_allclose(other(2.0), 6.0 * sound, rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_a_program_with_strict_promotion_can_solve_and_differentiate(kind):
+    A, one = np.array([[[1.0, 1.0]], [[1.0, 0.0]]], kind).reshape(2, 2), np.ones(2, kind)
+    low, high = np.array([1.0, 0.0], kind), np.array([1.0, 0.2], kind)
+    blocks = QP(np.eye(2, dtype=kind), -one, np.eye(2, dtype=kind)[:, None, :1], -one, one)
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        for qp in (
+            QP(np.eye(2, dtype=kind), 0 * one, A, low, high),
+            blocks._replace(A=A[:1, None]),
+        ):
+            qp = jax.tree.map(jnp.asarray, qp)
+            if qp.A.ndim == 3:
+                qp = qp._replace(l=qp.l[:1], u=qp.u[:1])
+            slope = jax.jit(jax.grad(jax.jit(lambda q, qp=qp: solve_qp(qp._replace(q=q)).x[0])))
+            assert np.isfinite(slope(qp.q)).all()
+            found = solve_qp(qp).x
+            assert found.dtype == kind
+    np.testing.assert_allclose(
+        solve_qp(QP(np.eye(2), 0.0 * one, A, low, high)).x, [0.2, 0.8], atol=1e-6
+    )
+
+
+def test_whole_numbers_are_solved_in_the_default_floats():
+    qp = QP(*(jnp.asarray(x) for x in ([[2, 0], [0, 2]], [-2, -5], [[1, 2]], [-10], [3])))
+    found = solve_qp(qp)
+    assert found.x.dtype == np.float64
+    np.testing.assert_allclose(found.x, [0.4, 1.3], atol=1e-12)

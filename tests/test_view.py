@@ -18,7 +18,7 @@ from hector_jax.control.weights_file import save_weights
 from hector_jax.core import inputs
 from hector_jax.core.files import write_json
 from hector_jax.core.journal import write_rows
-from hector_jax.report import pictures
+from hector_jax.report import pictures, view
 from hector_jax.report.motion import motion
 from hector_jax.report.view import ViewedWalk, arrows
 from hector_jax.robot.model import load_robot
@@ -128,6 +128,47 @@ def test_headless_writes_film_and_pictures_instead(monkeypatch, capsys, tmp_path
     assert list(filmed[0][2]) == ["before: nominal", "after: expert"]
     drawn = {"losses.png", "path.png", "tracking.png", "wrenches.png"}
     assert {file.name for file in out.iterdir()} == drawn
+
+
+@pytest.fixture(params=["127.0.0.1", "::1"])
+def page(request):
+    """A server of the page, and where it listens."""
+    pytest.importorskip("viser", reason="viser, of the extra view, is not installed")
+    try:
+        port = view._free_port(request.param, 0)
+    except inputs.InputError:
+        pytest.skip(f"this machine has no {request.param}")
+    server = view._server(request.param, port)
+    yield server, view._in_url(request.param), port
+    server.stop()
+
+
+def test_the_page_answers_its_own_origins_only(page):
+    import viser
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    def opens(origin, port=page[2]):
+        protocol = f"viser-v{viser.__version__}"
+        try:
+            with connect(f"ws://{page[1]}:{port}", origin=origin, subprotocols=[protocol]) as one:
+                return bool(one.recv())
+        except InvalidStatus as refusal:
+            return refusal.response.status_code != 403
+
+    own = [f"http://{name}:{page[2]}" for name in ("localhost", "127.0.0.1", "[::1]")]
+    assert all(map(opens, [None, *own]))
+    foreign = "https://evil.example", f"http://evil.example:{page[2]}", "http://localhost:1", "null"
+    assert not any(map(opens, foreign))
+
+
+def test_no_client_of_the_page_opens_a_tunnel(page, monkeypatch):
+    import viser._viser
+
+    opened = []
+    monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *_: opened.append(1))
+    assert page[0].request_share_url() is None  # what a client's message calls
+    assert not opened
 
 
 def until(seconds, seen):

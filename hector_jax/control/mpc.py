@@ -10,8 +10,7 @@ contact model. `max_contacts` is the largest number of feet in stance at once; i
 the inputs of the others have zero columns and a unit Hessian, so that shapes stay static.
 
 Differences from the paper: the cost is on x_1..x_N instead of x_0..x_{N-1}, because x_0 is given; a
-foot in the air has no M_z; the reference may be shifted towards the robot, see `controller`;
-see also `contact` and `twin`.
+foot in the air has no M_z; the reference may be shifted, see `controller`; also `contact`, `twin`.
 """
 
 import math
@@ -60,6 +59,10 @@ class MpcParameters(NamedTuple):
     integral: IntegralGains
 
 
+class _Default(tuple):
+    """Constraints that nobody has named: those of the contact model, also after `replace`."""
+
+
 @dataclass(frozen=True)
 class MpcConfig:
     """Static configuration of the MPC, and the defaults of its numbers."""
@@ -87,11 +90,13 @@ class MpcConfig:
     costs: tuple[Cost, ...] = ()  # beside Q and R
 
     def __post_init__(self) -> None:
+        unnamed = not self.constraints or isinstance(self.constraints, _Default)
         share, words = Range(0.0, 1.0, above=True), ("zero", "gravity")
         check(self, position_limit=POSITIVE, effort_reference=words, inertia_share=share)
         if len(got := self.inertia_share) != 3:
             raise InputError(f"MpcConfig.inertia_share must be 3 numbers, got {short_repr(got)}")
-        object.__setattr__(self, "constraints", self.constraints or self.contact.constraints)
+        if unnamed:
+            object.__setattr__(self, "constraints", _Default(self.contact.constraints))
         if not self.on("inputs"):
             text = "MpcConfig.constraints must have one on the inputs, or feet can pull"
             raise InputError(f"{text}, got {self.constraints}")
@@ -201,7 +206,6 @@ def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: in
     # angles after step k per rate that is constant from the end of step j on
     angles = later[:, :, None, None] * (angle_by_rate[:, None] - angle_by_rate)
     count = jnp.arange(1, N + 1, dtype=dtype)[:, None]
-    rate, speed = state.ang_velocity, state.velocity
     from_yaw_frame = rot_z(jnp.asarray(state.euler[2]))
     gained = dt * contract("xy,y->x", from_yaw_frame, disturbance.angular)
     pull = contract("xy,y->x", from_yaw_frame, disturbance.linear)
@@ -209,15 +213,14 @@ def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: in
     fall = dt * count * gravity
     free = State(
         state.euler
-        + contract("kxy,y->kx", angle_by_rate, rate)
+        + contract("kxy,y->kx", angle_by_rate, state.ang_velocity)
         + contract("kjxy,y->kx", angles, gained),
-        state.position + dt * count * speed - dt * (count - 1) / 2 * fall,
-        rate + count * gained,
-        speed - fall,
+        state.position + dt * count * state.velocity - dt * (count - 1) / 2 * fall,
+        state.ang_velocity + count * gained,
+        state.velocity - fall,
     )
     condensed = Condensed(feet, G, turn, push, angles, later, travel, free)
-    own = own_costs(config, problem, condensed) if config.costs else None
-    return condensed._replace(own=own)
+    return condensed._replace(own=own_costs(config, problem, condensed) if config.costs else None)
 
 
 def input_weights(weights: Weights) -> Float[Array, " u"]:
@@ -327,8 +330,7 @@ def _on_states(
 
     flat = states.reshape(*states.shape[:2], -1)
     horizon = problem.horizon
-    numbers = jnp.arange(len(flat))
-    steps = numbers, horizon.reference, horizon.contact, horizon.lever, flat, free
+    steps = jnp.arange(len(flat)), horizon.reference, horizon.contact, horizon.lever, flat, free
     A, *others = jax.vmap(of_step)(steps)
     return A.reshape(-1, A.shape[-1]), *(x.ravel() for x in others)
 
@@ -364,8 +366,7 @@ def build_qp(
     """Build the MPC as a condensed QP, and the states as functions of its inputs.
 
     Args:
-        config: shape of the problem.
-        problem: data of the problem.
+        config, problem: shape and data of the problem.
         dt: MPC step [s].
         max_contacts: largest number of feet in stance at once (static).
 
@@ -392,8 +393,7 @@ def solve_mpc(
     qp, condensed = build_qp(config, problem, dt=dt, max_contacts=max_contacts)
 
     def slope(x: Float[Array, " n"]) -> Float[Array, " n"]:
-        v = x.reshape(config.horizon, -1)
-        return 2.0 * half_slope(config, problem, condensed, v).ravel()
+        return 2.0 * half_slope(config, problem, condensed, x.reshape(config.horizon, -1)).ravel()
 
     first = condensed.inputs[0]
     solution = solve_qp(qp, config.qp, slope)

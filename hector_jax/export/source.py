@@ -115,10 +115,17 @@ def controller_source(
         "tables": _tables(config, robot),
         "tunables": dict(_tunables(config, robot, weights)),
     }
-    return {f: _TEMPLATES.get_template(f"{f}.j2").render(c=_c, **values) for f in FILES}
+
+    def render(id: str) -> dict[str, str]:
+        known = {**values, "c": _c, "id": id, "names": _NAMES}
+        return {f: _TEMPLATES.get_template(f"{f}.j2").render(known) for f in FILES}
+
+    # named by what they are: another export has other names in a program that links both
+    return render(hashlib.sha256("".join(render("").values()).encode()).hexdigest()[:12])
 
 
 FILES = ("controller.h", "controller.c")
+_NAMES = ("size", "exported", "lower", "upper", "init", "reset", "set_tunables", "step")
 
 
 def _c(value: Any) -> str:

@@ -5,8 +5,9 @@ Differentiating stationarity and the active rows gives, for tangents of the data
     P dx + A'dy = -(dP x + dq + dA'y),    A dx - dy / W = du (dl) - dA x,
 
 W_side = ((z + e) / (s + e))^2 from multiplier z and slack s of a side: infinite on active rows,
-zero on the others. The square is that of the central path: a weakly active row (z = s = 0), where
-the one-sided derivatives differ, gets a value between them. W is capped in the factorised matrix,
+zero on the others. The square is that of the central path: where the one-sided derivatives
+differ, one weakly active row (z = s = 0) gets a value between them; several that depend on each
+other get a finite one, which may lie outside. W is capped in the factorised matrix,
 and a second pass removes the cap's bias; degenerate vertices stay regular. The derivative is zero
 without status SOLVED. (In 32 bits the matrix of a minimiser that is almost not unique may have no
 Cholesky factor; the derivative is then NaN.)
@@ -14,16 +15,18 @@ Cholesky factor; the derivative is then NaN.)
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 from jax.scipy.linalg import cho_solve
 
 from hector_jax.core.arrays import Array
-from hector_jax.qp.linear import cholesky, matvec, plus_gram, rmatvec
+from hector_jax.qp.linear import cholesky, matvec, numpy_promotion, plus_gram, rmatvec
 from hector_jax.qp.method import QpConfig, solve_normal
 from hector_jax.qp.problem import QP, Normal, Solution, Status
 
@@ -60,13 +63,29 @@ def _follow(
     return found[0]
 
 
+def _second(primals: Any, tangents: Any) -> Any:
+    raise NotImplementedError("solve_qp has a first derivative only, a second one was asked for")
+
+
+# W by itself, which the derivative takes from fixed data: it raises where the conditions move it.
+# A rule of `jax.custom_jvp` would be lost in the reverse pass of a loop.
+_once = Primitive("differentiated_once")
+_once.def_impl(lambda weight, *_: weight)
+_once.def_abstract_eval(lambda weight, *_: weight)
+mlir.register_lowering(_once, lambda context, weight, *_: [weight])
+batching.primitive_batchers[_once] = lambda parts, axes: (_once.bind(*parts), axes[0])
+ad.primitive_jvps[_once] = _second
+
+
 @_follow.defjvp
+@numpy_promotion()
 def _jvp(config: QpConfig, primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
-    (solution, ratio, normal), d = primals[0], tangents[1]
+    ((solution, ratio, normal), at), d = primals, tangents[1]
     dtype = solution.x.dtype
     tolerances = config.tolerances(dtype)
     column, row = normal.column, normal.row
     weight = jnp.sum(ratio, axis=0)  # XLA repeats ratio[0] + ratio[1] in each use, a reduction not
+    weight = _once.bind(weight, *at)
     capped = weight >= tolerances.cap
     solved = solution.status == Status.SOLVED
     shift = weight * d.rows - ratio[0] * d.u - ratio[1] * d.l

@@ -1,11 +1,22 @@
 """Linear algebra of all methods; A is dense (m, n) or block-diagonal by step (N, r, b)."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Float
 
 from hector_jax.core.arrays import Array, contract
+
+
+@contextmanager
+def numpy_promotion() -> Iterator[None]:
+    """Promote dtypes and ranks as NumPy does, whatever the user's own JAX options say."""
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
 
 
 def matvec(A: Array, x: Array) -> Array:

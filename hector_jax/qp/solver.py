@@ -7,19 +7,21 @@ import numpy as np
 
 from hector_jax.core.arrays import Array
 from hector_jax.qp.derivative import differentiable_solve
+from hector_jax.qp.linear import numpy_promotion
 from hector_jax.qp.method import QpConfig
 from hector_jax.qp.problem import QP, Solution, Status
 
 
+@numpy_promotion()
 def solve_qp(
     qp: QP,
     config: QpConfig = QpConfig(),  # noqa: B008
     slope: Callable[[Array], Array] | None = None,
 ) -> Solution:
-    """Solve a QP; differentiable in both modes, for jit and vmap, in the dtype of the data.
+    """Solve a QP; differentiable once, in both modes, for jit and vmap, in the dtype of the data.
 
     Never raises on values and never returns a NaN: `status` qualifies the solution (`check_solved`
-    checks it).
+    checks it). Whole numbers become floats of JAX's default dtype.
 
     Args:
         qp: the data.
@@ -29,6 +31,7 @@ def solve_qp(
 
     Raises:
         ValueError: the shapes do not match.
+        NotImplementedError: a second derivative is asked for.
 
     The point of the line x + y = 1 that is nearest to the origin, with x at most 0.2:
 
@@ -39,7 +42,7 @@ def solve_qp(
     ([0.2, 0.8], 'SOLVED')
     """
     _check_shapes(qp)
-    dtype = jnp.result_type(*qp, jnp.float32)
+    dtype = jnp.result_type(jnp.result_type(*qp, float), jnp.float32)
     P, q, A, lower, upper = (jnp.asarray(v, dtype) for v in qp)
     # only the symmetric part of P matters; taking it here makes the derivative consistent
     return differentiable_solve(config, QP(0.5 * (P + P.T), q, A, lower, upper), slope)

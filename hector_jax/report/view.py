@@ -2,16 +2,20 @@
 
 Each displayed tick is one batch of updates. The walks are side by side, shifted across their
 heading. To follow them the world moves under the camera, so that the user can still turn the
-camera. The page is drawn by viser, of the extra `view`, and loads nothing from other machines.
+camera. The page is drawn by viser, of the extra `view`, loads nothing from other machines and
+answers no page of theirs.
 """
 
 import errno
 import logging
 import os
+import re
 import socket
 import time
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
+from functools import partial
+from http import HTTPStatus
 from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -102,16 +106,14 @@ def serve(
     Raises:
         InputError: the server cannot listen on the address.
     """
-    import viser
-
     # a browser that disconnects early would print a traceback
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     # viser prints the address itself
     with Path(os.devnull).open("w") as null, redirect_stdout(null):
-        server = viser.ViserServer(host, _free_port(host, port), label="hector", verbose=False)
+        server = _server(host, _free_port(host, port))
         try:
             note = server.gui.add_markdown("The robots walk in a moment.")
-            on_open(f"http://{host}:{server.get_port()}")
+            on_open(f"http://{_in_url(host)}:{server.get_port()}")
             motions, description = walk()
             note.remove()
             page = Page(server, motions, model, folder, description)
@@ -125,10 +127,41 @@ def serve(
             server.stop()
 
 
+def _server(host: str, port: int) -> Any:
+    """Return a `viser.ViserServer` that only its own page can reach, and that opens no tunnel."""
+    import viser
+    from websockets.asyncio import server as sockets
+
+    own = {"localhost", "127.0.0.1", "[::1]", _in_url(host)}
+
+    def refuse(connection: Any, request: Any, response: Any) -> Any:
+        """Refuse a page of another site; one of a name that is not ours may be of anybody's."""
+        asked, origin = request.headers.get("Host", ""), request.headers.get("Origin")
+        pages = {f"http://{name}:{port}" for name in own}
+        if host in ("0.0.0.0", "::") or re.sub(r":\d+$", "", asked) in own:
+            pages.add(f"http://{asked}")  # also through a tunnel from another port
+        foreign = origin is not None and origin not in pages
+        return connection.respond(HTTPStatus.FORBIDDEN, "of another site\n") if foreign else None
+
+    serve = sockets.serve  # viser passes no check on
+    sockets.serve = partial(serve, process_response=refuse)
+    try:
+        server = viser.ViserServer(host, port, label="hector", verbose=False)
+    finally:
+        sockets.serve = serve
+    server.request_share_url = lambda verbose=True: None  # any client can call it
+    return server
+
+
+def _in_url(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
+
+
 def _free_port(host: str, port: int) -> int:
     """Return the port, or a free one if it is in use."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        with socket.create_server((host, port)) as listener:
+        with socket.create_server((host, port), family=family) as listener:
             return listener.getsockname()[1]
     except OSError as error:
         if error.errno == errno.EADDRINUSE and port:

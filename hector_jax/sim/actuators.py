@@ -2,8 +2,8 @@
 
 A command is scaled by the motor's own gain, saturates at the motor's limit, is delayed, passes a
 first-order lag, and the ankle's linkage adds a share of the ankle torque at the knee (the ankle
-motor acts on knee + ankle; the public controllers compensate half of the map). All of it is linear
-after the limit and cheap, and the same function serves MuJoCo and MJX.
+motor acts on knee + ankle; the public controllers compensate half of the map). The sum is limited
+once more, as MuJoCo's own actuators do, so that all engines apply the same torque.
 """
 
 from typing import NamedTuple
@@ -53,4 +53,4 @@ def step_actuators(
     for first in range(0, len(torque), robot.description.leg_joints):
         driving, driven = (first + i - 1 for i in robot.description.linkage)
         torque = torque.at[driven].add(imperfections.linkage * torque[driving])
-    return motors, torque
+    return motors, jnp.clip(torque, -limit, limit)
