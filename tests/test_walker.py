@@ -173,7 +173,7 @@ def test_in_a_tuning_a_walk_that_is_not_made_is_a_fall(tmp_path, capsys):
 def test_a_program_that_hangs_is_ended_with_what_it_started(tmp_path):
     text = "import subprocess, time\n"
     text += f"a = subprocess.Popen([{sys.executable!r}, '-c', 'import time; time.sleep(60)'])\n"
-    text += "open('pid', 'w').write(str(a.pid))\ntime.sleep(60)\n"
+    text += "open(__file__ + '.pid', 'w').write(str(a.pid))\ntime.sleep(60)\n"
     with pytest.raises(InputError, match="took longer"):
         walked(program(tmp_path, text), limit=3.0)
     assert ended(tmp_path)
@@ -181,7 +181,7 @@ def test_a_program_that_hangs_is_ended_with_what_it_started(tmp_path):
 
 def ended(folder, patience=20.0):
     """Whether the process that a program noted comes to its end."""
-    stat, until = Path("/proc", (folder / "pid").read_text(), "stat"), time.monotonic() + patience
+    stat, until = Path("/proc", (folder / "mine.py.pid").read_text(), "stat"), time.monotonic() + patience
     while stat.exists() and " Z " not in stat.read_text():
         if time.monotonic() > until:
             return False
@@ -191,11 +191,11 @@ def ended(folder, patience=20.0):
 
 def test_a_program_ends_when_whoever_waits_for_it_is_killed(tmp_path):
     path = program(
-        tmp_path, "import os, time\nopen('pid', 'w').write(str(os.getpid()))\ntime.sleep(60)"
+        tmp_path, "import os, time\nopen(__file__ + '.pid', 'w').write(str(os.getpid()))\ntime.sleep(60)"
     )
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         walk = pool.submit(walked, path)
-        while not (tmp_path / "pid").exists() or not (tmp_path / "pid").read_text():
+        while not (tmp_path / "mine.py.pid").exists() or not (tmp_path / "mine.py.pid").read_text():
             time.sleep(0.02)
         (waiting,) = pool._processes
         os.kill(waiting, signal.SIGKILL)
