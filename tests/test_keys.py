@@ -196,7 +196,7 @@ def test_a_key_has_the_versions_of_all_packages_that_compute(see):
 
 
 def test_code_that_pip_put_into_any_folder_is_that_of_a_package(see, tmp_path, monkeypatch):
-    """By --target or on PYTHONPATH; not a file of the user there, nor what is installed to be edited."""
+    """By --target or on PYTHONPATH; not a user's file there, nor what is installed to be edited."""
 
     def keys(k, number):
         (tmp_path / "pack.dist-info" / "METADATA").write_text(f"Name: pack\nVersion: {number}\n")
