@@ -209,10 +209,12 @@ sys.exit(exit_code("toy", lambda: _call(walker, Path("request"), Path("log"))))
     ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)]
 )
 def test_a_program_ends_with_the_command_that_walks(tmp_path, number, code):
-    path = program(tmp_path, LEAVE + "time.sleep(60)")
+    path = tmp_path / "mine.py"
+    path.write_text(LEAVE + "time.sleep(60)")
     toy = subprocess.Popen([sys.executable, "-c", CALL, path], start_new_session=True)
     note = tmp_path / "mine.py.pid"
     while not note.exists() or not note.read_text():
+        assert toy.poll() is None
         time.sleep(0.02)
     os.killpg(toy.pid, number)  # as a terminal does
     assert toy.wait(timeout=20) == code
