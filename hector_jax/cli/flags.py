@@ -124,7 +124,7 @@ class ByWalker(Flags):
 
     walker: Annotated[Path | None, PathKind.FILE] = None  # program that walks (docs/howto/own.md)
     walker_limit: Annotated[float, Range(1, 86_400)] = 600.0  # longest time of one of its walks [s]
-    walker_uses: tuple[Path, ...] = ()  # files and folders that decide its walks, beside its code
+    walker_uses: tuple[Path, ...] = ()  # files and folders that decide its walks too
 
 
 @_command

@@ -71,22 +71,22 @@ def start_jax(on_cpu: bool = False) -> None:
         raise InputError(f"{what}: {one_line(error) or 'no such device here'}") from None
 
 
-class Start(NamedTuple):
+class Surroundings(NamedTuple):
     """What a program was started with, before `setup_jax` and `start_worker` change it."""
 
     environment: dict[str, str]
     cores: frozenset[int]  # empty where processes have none of their own
 
 
-_start: Start | None = None
+_start: Surroundings | None = None
 
 
-def started_with(parent: Start | None = None) -> Start:
-    """Return what this program was started with, or the parent of this worker; see `Start`."""
+def started_with(parent: Surroundings | None = None) -> Surroundings:
+    """Return what this program was started with, or the parent of this worker; see `Surroundings`."""
     global _start  # noqa: PLW0603
     if _start is None:
         cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else ()
-        _start = parent or Start(dict(os.environ), frozenset(cores))
+        _start = parent or Surroundings(dict(os.environ), frozenset(cores))
     return _start
 
 
@@ -155,7 +155,7 @@ def _claim_core(cores: Sequence[int]) -> int | None:
     return None
 
 
-def start_worker(parent: Start | None = None) -> None:
+def start_worker(parent: Surroundings | None = None) -> None:
     """Set up a worker process like its parent, which alone handles interrupts and accelerators.
 
     It is bound to a core: the XLA threads of several workers would wait for each other, which takes
