@@ -82,7 +82,7 @@ _start: Surroundings | None = None
 
 
 def started_with(parent: Surroundings | None = None) -> Surroundings:
-    """Return what this program was started with, or the parent of this worker; see `Surroundings`."""
+    """Return what this program, or the parent of this worker, was started with."""
     global _start  # noqa: PLW0603
     if _start is None:
         cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else ()
