@@ -5,6 +5,7 @@ import sys
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
+from importlib.util import module_from_spec, spec_from_file_location
 from types import ModuleType
 
 import jax.numpy as jnp
@@ -169,7 +170,8 @@ def see(monkeypatch):
             if hasattr(module, name or ""):
                 monkeypatch.setattr(module, name, fake)
         code_hash.cache_clear()
-        identity._versions.cache_clear()
+        for found in (identity._versions, identity._distributions, identity._is_installed):
+            found.cache_clear()
 
     yield put
     monkeypatch.undo()
@@ -193,12 +195,41 @@ def test_a_key_has_the_versions_of_all_packages_that_compute(see):
             assert (key() != before) == (package != "msgspec"), package
 
 
+def test_code_that_pip_put_into_any_folder_is_that_of_a_package(see, tmp_path, monkeypatch):
+    """By --target or on PYTHONPATH; not a user's file there, nor what is installed to be edited."""
+
+    def keys(k, number):
+        (tmp_path / "pack.dist-info" / "METADATA").write_text(f"Name: pack\nVersion: {number}\n")
+        (tmp_path / "pack.dist-info" / "top_level.txt").write_text("pack\nedited\n")
+        made = []
+        for folder, name in (("", "pack"), ("", "mine"), ("src", "edited")):
+            path = tmp_path / folder / f"{name}.py"
+            path.write_text(f"def f(x): return {k} * x")
+            monkeypatch.delitem(sys.modules, name, raising=False)
+            spec = spec_from_file_location(name, path)
+            monkeypatch.setitem(sys.modules, name, module_from_spec(spec))
+            exec(path.read_text(), vars(sys.modules[name]))
+            made.append(function_id(sys.modules[name].f))
+        return made
+
+    for folder in ("pack.dist-info", "src"):
+        (tmp_path / folder).mkdir()
+    monkeypatch.syspath_prepend(tmp_path)
+    see()
+    before, code = keys(2.0, 1), keys(3.0, 1)
+    see()
+    package = keys(2.0, 2)
+    assert [x == y for x, y in zip(before, code, strict=True)] == [True, False, False]
+    assert before[0] != package[0]
+
+
 @pytest.mark.parametrize(
     ("module", "old", "new", "same"),
     [
         ("control.footstep", "config.ahead * stance", "config.travel * stance", False),
         ("control.footstep", "    points = (", "    # a comment\n    points = (", True),
         ("control.footstep", "Next touchdown of each foot", "Another docstring", True),
+        ("core.numerics", "threadpool_limits(1,", "threadpool_limits(4,", False),
         ("core.console", "_QUIET = 15.0", "_QUIET = 16.0", True),
         ("export.export", "TOLERANCE = 1e-6", "TOLERANCE = 1e-7", True),
     ],

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ import pytest
 from threadpoolctl import threadpool_info
 
 from hector_jax.core import runtime
+from hector_jax.core.inputs import InputError
 from hector_jax.core.numerics import add_flags, without_our_flags
 
 
@@ -34,6 +36,32 @@ def test_a_worker_computes_in_64_bits_and_draws_what_its_parent_draws(monkeypatc
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no binding to cores")
 def test_workers_share_out_the_cores():
     assert [runtime._claim_core([-1, -2]) for _ in range(4)] == [-1, -2, -1, -2]
+
+
+def test_where_no_core_can_be_claimed_a_worker_keeps_all(monkeypatch):
+    monkeypatch.setattr(runtime.socket.socket, "bind", mock.Mock(side_effect=PermissionError))
+    monkeypatch.setattr(os, "sched_setaffinity", mock.Mock(), raising=False)
+    runtime.start_worker()
+    os.sched_setaffinity.assert_not_called()
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no binding to cores")
+def test_a_single_worker_has_one_core_as_each_of_several():
+    """Else the number of processes would change the rounding of results."""
+    with runtime.workers(1) as pool:
+        assert len(pool.submit(os.sched_getaffinity, 0).result(timeout=60)) == 1
+
+
+def test_without_semaphores_one_process_computes_and_several_are_refused(monkeypatch):
+    refused = mock.Mock(side_effect=OSError(30, "Read-only file system"))
+    monkeypatch.setattr("_multiprocessing.SemLock", refused)
+    with runtime.workers(1) as pool:
+        assert list(pool.map(pow, (2, 3), (2, 2))) == [4, 9]
+        assert pool.submit(os.getpid).result() == os.getpid()
+        assert isinstance(pool.submit(int, "x").exception(), ValueError)
+    with pytest.raises(InputError, match="no worker processes: .* --processes 1 needs none"):
+        with runtime.workers(2):
+            pass
 
 
 def test_linear_algebra_has_one_thread_whatever_the_cores():

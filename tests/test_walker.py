@@ -2,10 +2,13 @@
 
 import json
 import os
+import shutil
 import signal
+import subprocess
 import sys
 import time
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from contextlib import nullcontext
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -146,6 +149,7 @@ def test_a_program_walks_with_the_weights_and_the_command_that_it_is_asked_for(t
     [
         ("raise SystemExit('no solver')", "ended with code 1: no solver"),
         ("import time; time.sleep(60)", "took longer than 2 s; killed"),
+        ("raise SystemExit(124)", "ended with code 124: no output"),
         ("", "ended with code 0, but wrote no log"),
         (
             "log.pop('joints')\n" + WRITE,
@@ -170,18 +174,98 @@ def test_in_a_tuning_a_walk_that_is_not_made_is_a_fall(tmp_path, capsys):
     assert "ended with code 1: no solver; counts as a fall" in capsys.readouterr().err
 
 
-def test_a_program_that_hangs_is_ended_with_what_it_started(tmp_path):
-    text = "import subprocess, time\n"
-    text += f"a = subprocess.Popen([{sys.executable!r}, '-c', 'import time; time.sleep(60)'])\n"
-    text += "open('pid', 'w').write(str(a.pid))\ntime.sleep(60)\n"
-    with pytest.raises(InputError, match="took longer"):
-        walked(program(tmp_path, text), limit=3.0)
+# starts a program in another session, which keeps its output open, and notes its number
+LEAVE = f"""
+import subprocess, time
+left = [{sys.executable!r}, "-c", "import time; time.sleep(60)"]
+number = subprocess.Popen(left, start_new_session=True).pid
+open(__file__ + ".pid", "w").write(str(number))
+"""
+
+
+@pytest.mark.parametrize("hangs", [True, False])
+def test_a_program_is_ended_with_all_that_it_started(tmp_path, hangs):
+    path, start = (
+        program(tmp_path, LEAVE + ("time.sleep(60)" if hangs else WRITE)),
+        time.monotonic(),
+    )
+    with pytest.raises(InputError, match="took longer") if hangs else nullcontext():
+        walked(path, limit=4.0)
+    assert time.monotonic() - start < 20.0
     assert ended(tmp_path)
+
+
+CALL = """
+import sys
+from pathlib import Path
+from hector_jax.core.console import exit_code
+from hector_jax.sim.walker import _call, walker_of
+walker = walker_of(Path(sys.argv[1]), 60.0)
+sys.exit(exit_code("toy", lambda: _call(walker, Path("request"), Path("log"))))
+"""
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -9)]
+)
+def test_a_program_ends_with_the_command_that_walks(tmp_path, number, code):
+    path = tmp_path / "mine.py"
+    path.write_text(LEAVE + "time.sleep(60)")
+    toy = subprocess.Popen([sys.executable, "-c", CALL, path], start_new_session=True)
+    note = tmp_path / "mine.py.pid"
+    while not note.exists() or not note.read_text():
+        assert toy.poll() is None
+        time.sleep(0.02)
+    os.killpg(toy.pid, number)  # as a terminal does
+    assert toy.wait(timeout=20) == code
+    assert ended(tmp_path)
+
+
+SEES = """#!/usr/bin/env python3
+import json, os, sys
+names = "JAX_ENABLE_X64", "XLA_FLAGS", "PWD"
+seen = [os.environ.get(name) for name in names], os.getcwd(), sorted(os.sched_getaffinity(0))
+open(sys.argv[2], "w").write(json.dumps(seen))
+"""
+SHOW = """
+import os, sys
+from pathlib import Path
+from hector_jax.core.runtime import setup_jax, workers
+from hector_jax.sim.walker import _call, walker_of
+if __name__ == "__main__":
+    os.sched_setaffinity(0, {int(sys.argv[2])})
+    setup_jax()
+    call = walker_of(Path(sys.argv[1]), 60.0), Path("request")
+    os.sched_setaffinity(0, range(64))
+    _call(*call, Path("here"))
+    os.sched_setaffinity(0, {int(sys.argv[2])})
+    with workers(1) as pool:
+        pool.submit(_call, *call, Path("there")).result()
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no binding to cores")
+def test_a_program_gets_what_the_command_was_started_with(tmp_path):
+    """Not what this program changes for itself and for its workers."""
+    (tmp_path / "show.py").write_text(SHOW)
+    path, core = tmp_path / "sees.py", max(os.sched_getaffinity(0))
+    path.write_text(SEES)
+    path.chmod(0o755)
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    usual = {n: x for n, x in os.environ.items() if n != "XLA_FLAGS"}
+    usual |= {"JAX_ENABLE_X64": "1", "PWD": str(folder), "PYTHONPATH": str(ROOT)}
+    line = [sys.executable, tmp_path / "show.py", path, str(core)]
+    subprocess.run(line, cwd=folder, env=usual, check=True)
+    for log in ("here", "there"):
+        seen = json.loads((folder / log).read_text())
+        assert seen == [["1", None, str(folder)], str(folder), [core]]
 
 
 def ended(folder, patience=20.0):
     """Whether the process that a program noted comes to its end."""
-    stat, until = Path("/proc", (folder / "pid").read_text(), "stat"), time.monotonic() + patience
+    number, until = (folder / "mine.py.pid").read_text(), time.monotonic() + patience
+    stat = Path("/proc", number, "stat")
     while stat.exists() and " Z " not in stat.read_text():
         if time.monotonic() > until:
             return False
@@ -190,12 +274,10 @@ def ended(folder, patience=20.0):
 
 
 def test_a_program_ends_when_whoever_waits_for_it_is_killed(tmp_path):
-    path = program(
-        tmp_path, "import os, time\nopen('pid', 'w').write(str(os.getpid()))\ntime.sleep(60)"
-    )
+    path, note = program(tmp_path, LEAVE + "time.sleep(60)"), tmp_path / "mine.py.pid"
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         walk = pool.submit(walked, path)
-        while not (tmp_path / "pid").exists() or not (tmp_path / "pid").read_text():
+        while not note.exists() or not note.read_text():
             time.sleep(0.02)
         (waiting,) = pool._processes
         os.kill(waiting, signal.SIGKILL)
@@ -217,6 +299,38 @@ def test_walks_of_another_program_have_another_key(tmp_path):
     one, same, other = (walker_engine(walker_of(program(tmp_path, x), 1.0)).key for x in texts)
     assert one == same != other
     assert one != MUJOCO_C._replace(name="mine.py").key
+
+
+@pytest.mark.parametrize(
+    ("file", "same"),
+    [
+        ("notes.py", True),
+        ("lib/__pycache__/a.pyc", True),
+        ("gains.py", False),
+        ("model/inner/part.py", False),
+        ("lib/gains.yaml", False),
+        ("plant.bin", False),
+    ],
+)
+def test_walks_are_known_by_what_makes_them(tmp_path, file, same):
+    """The program, what it imports from its folder and what it names; not where that is."""
+
+    def key(folder, content, limit=1.0):
+        (folder / file).write_text(content)
+        uses = (folder / "lib", folder / "plant.bin")
+        return walker_engine(walker_of(folder / "mine.py", limit, uses)).key
+
+    names = "notes.py lib/__pycache__/a.pyc gains.py model/inner/part.py lib/gains.yaml plant.bin"
+    for path in map((tmp_path / "one").joinpath, names.split()):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("")
+    program(tmp_path / "one", "import gains, model.inner.part\n" + WRITE)
+    shutil.copytree(tmp_path / "one", tmp_path / "two")
+    one = key(tmp_path / "one", "")
+    assert one == key(tmp_path / "two", "", limit=2.0)
+    assert (one == key(tmp_path / "two", "a = 1")) == same
+    with pytest.raises(InputError, match=r"walker-uses .*gone: no such file or folder"):
+        walker_of(tmp_path / "one" / "mine.py", 1.0, (tmp_path / "gone",))
 
 
 def test_the_example_walks_by_a_controller_of_its_own():

@@ -62,7 +62,7 @@ def engine_of(args: Evaluate | Tune | Verdict | Walk) -> Engine:
         if hasattr(args, name) and args.is_given(name):
             text = f"--{name.replace('_', '-')} is for this project's controller and simulators"
             raise InputError(f"{text}, so not beside --walker")
-    walker = walker_of(args.walker, args.walker_limit)
+    walker = walker_of(args.walker, args.walker_limit, args.walker_uses)
     if isinstance(args, Tune):  # it goes on over night
         walker = walker._replace(strict=False)
     elif isinstance(args, Walk):

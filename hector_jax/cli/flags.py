@@ -122,9 +122,9 @@ class ForRobot(Flags):
 class ByWalker(Flags):
     """A command whose walks a program of the user can make."""
 
-    # program that walks with a controller and a simulator of its own (docs/howto/own.md)
-    walker: Annotated[Path | None, PathKind.FILE] = None
+    walker: Annotated[Path | None, PathKind.FILE] = None  # program that walks (docs/howto/own.md)
     walker_limit: Annotated[float, Range(1, 86_400)] = 600.0  # longest time of one of its walks [s]
+    walker_uses: tuple[Path, ...] = ()  # files and folders that decide its walks too
 
 
 @_command

@@ -34,7 +34,10 @@ _CODE = (*COLLECTION_CODE, "grfm.training", "sim.standin", "verdict.choice", "wa
 # flags of a call, not of the run that it begins or resumes
 _CALL_FLAGS = ("config", "each", "out", "resume", "runs")
 # flags that may change when a run is resumed
-_FREE_FLAGS = ("cluster", "data", "json", "processes", "verdict", "video")
+_FREE_FLAGS = (
+    *("cluster", "data", "json", "processes", "verdict", "video"),
+    *("walker", "walker_limit", "walker_uses"),  # the record of its walks tells what it is
+)
 # flags that say nothing to a program of the user
 _OF_OUR_CONTROLLER = "alpha data iterations net safe smooth variant verdict".split()
 
@@ -162,7 +165,8 @@ def merge_flags(folder: Path, begun: F, args: F, call_flags: Sequence[str]) -> F
             continue
         old, new = getattr(begun, name), getattr(args, name)
         flags[name] = new if args.is_given(name) else old
-        if name not in _FREE_FLAGS and flags[name] != old:
+        is_free = name in _FREE_FLAGS and not (name == "walker" and old is None)
+        if not is_free and flags[name] != old:
             old, new = (" ".join(x) if isinstance(x, tuple) else x for x in (old, new))
             flag = f"--{name.replace('_', '-')}"
             raise InputError(f"{folder}: begun with {flag} {old}, got {new}")

@@ -49,7 +49,7 @@ def _start(expected: _Versions) -> None:
     from distributed import get_worker
 
     _check_worker(expected, get_worker())
-    start_worker(bind=True)
+    start_worker()
 
 
 def _run(expected: _Versions, job: bytes) -> Any:

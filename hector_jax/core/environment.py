@@ -116,7 +116,7 @@ def _syntax(source: bytes) -> tuple[str, list[str], set[str]]:
         The tree as text, the modules of this package and the other packages that it imports.
     """
     tree = ast.parse(source)
-    names, package = set(_imported(tree)), f"{_ROOT.name}."
+    names, package = set(imported_names(tree)), f"{_ROOT.name}."
     own = [name.removeprefix(package) for name in sorted(names) if name.startswith(package)]
     others = {name.partition(".")[0] for name in names}
     others -= {_ROOT.name, *sys.stdlib_module_names, *_NO_NUMBER_PACKAGES}
@@ -134,7 +134,7 @@ def _source(module: str) -> Path:
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 
-def _imported(tree: ast.Module) -> Iterator[str]:
+def imported_names(tree: ast.Module) -> Iterator[str]:
     """Yield the full names of all that a module imports, and of the modules that it is from."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):

@@ -8,13 +8,13 @@ from collections.abc import Callable, Container, Iterator, Mapping
 from functools import cache, partial
 from importlib.metadata import packages_distributions, version
 from inspect import unwrap
+from pathlib import Path
 from types import CellType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import jax
 import numpy as np
 
-_INSTALLED = ("site-packages", "dist-packages")
 _NOT_CONTENT = (
     "__dict__ __weakref__ __doc__ __firstlineno__ __static_attributes__ __module__ __name__"
     " __file__"  # a moved checkout is the same code
@@ -158,4 +158,11 @@ def _origin(value: Any) -> str:
     top, file = name.partition(".")[0], getattr(sys.modules.get(name), "__file__", None)
     if top == __name__.partition(".")[0] or (top in sys.stdlib_module_names and top != "__main__"):
         return "ours"
-    return "installed" if any(folder in str(file) for folder in _INSTALLED) else "user"
+    return "installed" if top in _distributions() and _is_installed(name, file or "") else "user"
+
+
+@cache
+def _is_installed(module: str, file: str) -> bool:
+    """Tell whether the folder that a module is imported from is one of installed packages."""
+    above = list(Path(file).parents)[module.count(".") + (Path(file).stem == "__init__") :]
+    return any(above) and next(above[0].glob("*.dist-info"), None) is not None

@@ -12,6 +12,8 @@ import sys
 from functools import cache
 from typing import Any
 
+from threadpoolctl import threadpool_limits
+
 PINNED = {
     "jax_enable_x64": True,  # the QP mixes weights of 1e2 and 1e-5
     "jax_default_matmul_precision": "highest",  # else a GPU rounds numbers of 32 bits before
@@ -58,9 +60,16 @@ _FLAGS = {
 
 
 def pin_options() -> None:
-    """Give JAX's options the values that programs are made for; call before the first array."""
-    import jax
+    """Give JAX's options the values that programs are made for; call before the first array.
 
+    Linear algebra on a CPU (NumPy's too) gets one thread.
+    """
+    import jax
+    import scipy.linalg  # noqa: F401  # loads the LAPACK that XLA calls
+
+    # Its threads would wait for each other in small systems, and the number of cores would change
+    # the rounding of results.
+    threadpool_limits(1, user_api="blas")
     add_flags()
     values = (_defaults() if not_used() else {}) | PINNED
     for name in jax.config.values:  # which differ between versions

@@ -11,16 +11,15 @@ import socket
 import tempfile
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from itertools import product
 from multiprocessing import active_children, parent_process
 from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
-
-from threadpoolctl import threadpool_limits
+from typing import Any, NamedTuple
 
 from hector_jax.core.inputs import InputError, check_utf8, one_line, outside_packages
 from hector_jax.core.numerics import pin_options
@@ -72,20 +71,35 @@ def start_jax(on_cpu: bool = False) -> None:
         raise InputError(f"{what}: {one_line(error) or 'no such device here'}") from None
 
 
+class Surroundings(NamedTuple):
+    """What a program was started with, before `setup_jax` and `start_worker` change it."""
+
+    environment: dict[str, str]
+    cores: frozenset[int]  # empty where processes have none of their own
+
+
+_start: Surroundings | None = None
+
+
+def started_with(parent: Surroundings | None = None) -> Surroundings:
+    """Return what this program, or the parent of this worker, was started with."""
+    global _start  # noqa: PLW0603
+    if _start is None:
+        cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else ()
+        _start = parent or Surroundings(dict(os.environ), frozenset(cores))
+    return _start
+
+
 def setup_jax() -> None:
     """Turn on 64 bits and the compilation cache; call before the first array.
 
-    All of JAX's options that could change numbers are pinned (`core.numerics`). CPU programs are
-    dispatched synchronously, linear algebra on a CPU (NumPy's too) runs in one thread, and Python's
-    garbage collector runs less often.
+    All options that could change numbers are pinned (`core.numerics`). CPU programs are dispatched
+    synchronously, and Python's garbage collector runs less often.
     """
     import jax
-    import scipy.linalg  # noqa: F401  # loads the LAPACK that XLA calls
 
+    started_with()
     pin_options()
-    # Its threads would wait for each other in small systems, and the number of cores would change
-    # the rounding of results.
-    threadpool_limits(1, user_api="blas")
     # Run a CPU program in the calling thread: waking another thread takes as long as the small
     # programs of a walk.
     jax.config.update("jax_cpu_enable_async_dispatch", False)
@@ -127,35 +141,66 @@ def _leave_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _claim_core(cores: Sequence[int]) -> int:
+def _claim_core(cores: Sequence[int]) -> int | None:
     """Return the core that the fewest worker processes of this machine have; now this one has it.
 
-    A claim is a name of a socket. It is no file: the name is free when the process ends.
+    A claim is a name of a socket. It is no file: the name is free when the process ends. Where no
+    name can be claimed the answer is None.
     """
     for turn, core in product(range(64), cores):
         with socket.socket(socket.AF_UNIX) as claim, suppress(OSError):
             claim.bind(f"\0hector_jax core {core}, {turn}")
             claim.detach()
             return core
-    return cores[0]
+    return None
 
 
-def start_worker(bind: bool) -> None:
+def start_worker(parent: Surroundings | None = None) -> None:
     """Set up a worker process like its parent, which alone handles interrupts and accelerators.
 
+    It is bound to a core: the XLA threads of several workers would wait for each other, which takes
+    several times as long, and their number would change the rounding of results.
+
     Args:
-        bind: bind the process to a core. Otherwise the XLA threads of several workers would wait
-            for each other, which takes several times as long.
+        parent: what it was started with; by default what this process was started with.
     """
     _leave_with_parent()
-    if bind and hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {_claim_core(sorted(os.sched_getaffinity(0)))})
+    cores = started_with(parent).cores
+    if cores and (core := _claim_core(sorted(cores))) is not None:
+        os.sched_setaffinity(0, {core})
     # MuJoCo's about a robot's file, which the parent has read too
     warnings.filterwarnings("ignore", category=UserWarning, module="hector_jax")
     import jax
 
     jax.config.update("jax_platforms", "cpu")
     setup_jax()
+
+
+class _Here(Executor):
+    """Calls in this process."""
+
+    def map(self, fn: Callable[..., Any], *iterables: Iterable[Any], **_: Any) -> Iterator[Any]:
+        return map(fn, *iterables)
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        done = Future()
+        try:
+            done.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            done.set_exception(error)
+        return done
+
+
+def _local_pool(processes: int) -> Executor:
+    """Return the pool of `workers`; one without a process where a machine allows no pool of one."""
+    start = {"initializer": start_worker, "initargs": (started_with(),)}
+    try:
+        return ProcessPoolExecutor(processes, _Spawn(), **start)
+    except (OSError, ImportError, NotImplementedError) as error:  # of its semaphores
+        if processes == 1:
+            return _Here()
+        text = f"no worker processes: {one_line(error)} (is /dev/shm there and writable?)"
+        raise InputError(f"{text}; --processes 1 needs none") from None
 
 
 @contextmanager
@@ -166,8 +211,11 @@ def workers(processes: int, cluster: str | None = None) -> Iterator[Executor]:
     are spawned.
 
     Args:
-        processes: their number.
+        processes: their number; where no pool can be made, 1 computes in this process.
         cluster: address of a scheduler, whose workers are used instead (`core.cluster`).
+
+    Raises:
+        InputError: this machine allows no pool of several processes.
     """
     if cluster is not None:
         from hector_jax.core.cluster import cluster_workers  # which starts with JAX
@@ -175,9 +223,8 @@ def workers(processes: int, cluster: str | None = None) -> Iterator[Executor]:
         with cluster_workers(cluster) as pool:
             yield pool
         return
-    spawn, others = _Spawn(), active_children()
-    start = {"initializer": start_worker, "initargs": (processes > 1,)}
-    with ProcessPoolExecutor(processes, spawn, **start) as pool:
+    others = active_children()
+    with _local_pool(processes) as pool:
         try:
             yield pool
         except BaseException:

@@ -48,11 +48,12 @@ class Engine(NamedTuple):
     # differences of its plants from MuJoCo C, for reports; empty means the same physics, and a walk
     # that falls is then diagnosed in MuJoCo C
     differs: str = ""
+    content: str = ""  # of a program that walks; empty means the function `walk`
 
     @property
     def key(self) -> str:
         """What identifies it in keys of stored walks, beside the code of `modules`."""
-        return f"{self.name} {self.version} {function_id(self.walk)}"
+        return f"{self.name} {self.version} {self.content or function_id(self.walk)}"
 
     @property
     def version(self) -> str | None:
