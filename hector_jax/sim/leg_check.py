@@ -77,7 +77,7 @@ def _stand(
     points = np.einsum("tij,tfpj->tfpi", R, soles) + position[:, None, None]
     span, found = span_of(period), np.zeros((3, stance.shape[1]))
     windows = np.lib.stride_tricks.sliding_window_view(stance, 2 * span + 1, axis=0)
-    standing = windows.all(axis=-1)
+    standing = np.asarray(windows.all(axis=-1))
     velocity = slope(points, period)[span // 2 :][: len(standing)]
     for foot in np.flatnonzero(standing.any(axis=0)):
         v, height = velocity[standing[:, foot], foot], points[stance[:, foot], foot, :, 2]
@@ -195,8 +195,7 @@ def _mended(guess: Guess, as_is: Stand, known: np.ndarray) -> np.ndarray:
         feet = feet & (guess.stand.error < BETTER * as_is.error)
     if not feet.any() or _rms(guess.stand.error[feet]) > BETTER * _rms(as_is.error[feet]):
         return np.zeros_like(feet)
-    slower = _rms(guess.stand.slide[feet]) < 1.1 * _rms(as_is.slide[feet])
-    return feet & slower
+    return feet & (_rms(guess.stand.slide[feet]) < 1.1 * _rms(as_is.slide[feet]))
 
 
 def _told(guess: Guess, robot: Robot, feet: np.ndarray) -> str:
@@ -207,7 +206,7 @@ def _told(guess: Guess, robot: Robot, feet: np.ndarray) -> str:
         which = "" if feet.all() else f"of {', '.join(robot.description.legs[i] for i in legs)}"
     else:
         each = [" and ".join(names[i * count + j] for j in guess.joints) for i in legs]
-        which = ", ".join(each) + (" and its likes" if feet.all() and len(feet) > 1 else "")
+        which = ", ".join(each) + " and its likes" * bool(feet.all())
     return " ".join(guess.words.format(which).split())
 
 
@@ -230,7 +229,7 @@ def legs_found(robot: Robot, walk: Trajectory, stance: Bool[np.ndarray, "n feet"
             yield f"{which} {does} not move while the likes in other legs do: encoders, or the log"
     R = np.asarray(jax.vmap(rotation_from_euler)(walk.state.euler))
     log = _Tried(robot, walk, stance, by_leg, R)
-    as_is, known = log.stand(), ~still.any(axis=1)
+    as_is, known = log.stand(), np.asarray(~still.any(axis=1))
 
     def where(feet: np.ndarray) -> str:
         named = "" if feet.all() else f" ({', '.join(x for x in np.array(legs)[feet])})"
