@@ -85,7 +85,7 @@ def read_entries(path: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             found = {}
-            for name in {*names}.intersection(archive.files):
+            for name in [x for x in names if x in archive.files]:
                 found[name] = archive[name]
             return found
     except Exception as error:  # a foreign archive can fail in any way
