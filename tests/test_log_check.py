@@ -12,16 +12,20 @@ from model import ROBOT
 from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import expert, nominal
-from hector_jax.core.geometry import rotation_from_euler
+from hector_jax.core.geometry import euler_rates, rotation_from_euler
 from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import named_leaves
+from hector_jax.robot.kinematics import foot_poses, inverse_legs
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.diagnosis import record_walk
 from hector_jax.sim.log_check import check_log, read_check
 from hector_jax.sim.loop import Job
+from hector_jax.sim.parity import compare_plans
+from hector_jax.sim.walk_file import read_walk
 from hector_jax.sim.world import hfs, named_world
 
 SECONDS, TICK = 2.0, 0.01
+QUADRUPED = load_robot(Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml")
 
 
 def entries_of(robot, job):
@@ -141,6 +145,179 @@ def test_of_two_faults_each_is_named(tmp_path, sound):
         assert all(any(re.search(name, line) for line in lines) for name in (one, other)), lines
 
 
+def kinematic_log(robot, turn):
+    """A trot of planted feet, 2 s, from kinematics alone, with what a log needs."""
+    period, half = 0.005, 0.2
+    t = period * np.arange(1, 401)
+    legs = len(robot.foot_point)
+    standing = np.asarray(robot.standing_joints)
+    feet = np.asarray(foot_poses(robot, standing).position) - np.asarray(robot.com_offset)
+    pose = lambda t: (  # noqa: E731
+        np.stack([0.02 * np.sin(9 * t), 0.01 * np.sin(7 * t), turn * t + 0.01 * np.sin(5 * t)], -1),
+        np.stack([0.4 * t, 0.01 * np.sin(8 * t), 0 * t + float(robot.standing_height)], -1),
+    )
+
+    def plant(k, foot):  # under its hip in the middle of the k-th half
+        (_, _, yaw), place = pose(np.asarray((k + 0.5) * half))
+        x, y = feet[foot, :2]
+        there = place[:2] + [x * np.cos(yaw) - y * np.sin(yaw), x * np.sin(yaw) + y * np.cos(yaw)]
+        return np.append(there, 0.0)
+
+    euler, position = pose(t)
+    k, share = np.floor(t / half - 1e-9).astype(int), (t / half - 1e-9) % 1.0
+    target, stance = np.zeros((len(t), legs, 3)), np.zeros((len(t), legs), bool)
+    for foot in range(legs):
+        stance[:, foot] = (k + foot % 2 + foot // 2) % 2 == 0
+        for n in range(len(t)):
+            if stance[n, foot]:
+                target[n, foot] = plant(k[n], foot)
+            else:
+                before, after = plant(k[n] - 1, foot), plant(k[n] + 1, foot)
+                lift = [0.0, 0.0, 0.03 * np.sin(np.pi * share[n])]
+                target[n, foot] = before + share[n] * (after - before) + lift
+    R = np.asarray(jax.vmap(rotation_from_euler)(euler))
+    local = np.einsum("tij,tfi->tfj", R, target - position[:, None]) + np.asarray(robot.com_offset)
+
+    def follow(start, inputs):
+        place, R, yaw = inputs
+        up = jax.numpy.tile(R[2], (legs, 1))
+        joints = inverse_legs(robot, place, jax.numpy.zeros(legs), up, start, steps=8)
+        return joints, joints
+
+    _, joints = jax.jit(lambda *x: jax.lax.scan(follow, standing, x))(local, R, euler[:, 2])
+    rates = np.gradient(euler, t, axis=0)
+    E = np.asarray(jax.vmap(euler_rates)(euler))
+    force = np.zeros((len(t), legs, 3))
+    weight = float(robot.mass * robot.gravity[2])
+    force[..., 2] = stance * weight / stance.sum(axis=1, keepdims=True)
+    force[1::2, :, 0] = 1.0
+    state = {
+        "euler": euler,
+        "position": position,
+        "ang_velocity": np.linalg.solve(E, rates[..., None])[..., 0],
+        "velocity": np.gradient(position, t, axis=0),
+    }
+    log = {f"state.{name}": x for name, x in state.items()}
+    log |= {f"initial.{name}": x[0] for name, x in state.items()}
+    walk = {"command.force": force, "command.moment": 0 * force, "joints": np.asarray(joints)}
+    return {"period": np.array(period), **log, **walk, "contact": stance}
+
+
+BODIES = {2: ROBOT, 4: QUADRUPED}
+
+
+@pytest.fixture(scope="module", params=[(2, 0.0), (4, 0.0), (4, 0.8)], ids=str)
+def planted(request):
+    feet, turn = request.param
+    return BODIES[feet], kinematic_log(BODIES[feet], turn)
+
+
+def legs_told(folder, robot, entries):
+    """What is found of joints, feet, angles and units; the path is another one than the command."""
+    path = r"reference all along|off the commanded path|the command changes"
+    lines = found(folder, entries, robot, "straight")
+    return [line for line in lines if not re.search(path, line)]
+
+
+def legs_of(robot, log, name="joints"):
+    return log[name].reshape(len(log["joints"]), len(robot.foot_point), -1)
+
+
+def test_planted_feet_and_foreign_entries_have_nothing_to_tell(tmp_path, planted):
+    robot, log = planted
+    assert legs_told(tmp_path, robot, log) == []
+    foreign = {"info": np.array({"robot": "mine"}, dtype=object)}
+    assert legs_told(tmp_path, robot, log | foreign) == []
+
+
+def test_each_joint_of_the_other_sign_or_dead_is_named_with_its_foot(tmp_path, planted):
+    robot, log = planted
+    names, count = robot.description.joints, robot.description.leg_joints
+    for i, name in enumerate(names):
+        dead, joints = log["joints"].copy(), log["joints"]
+        dead[150:, i] = dead[150, i]
+        if np.ptp(joints[:, i]) > 0.05:
+            lines = legs_told(tmp_path, robot, log | {"joints": dead})
+            assert lines[0].startswith(f"{name} does not move"), (name, lines)
+        if np.abs(joints[:, i]).max() < 0.2:
+            continue  # its sign hardly matters
+        sign = np.where(np.arange(len(names)) == i, -1, 1)
+        (line,) = legs_told(tmp_path, robot, log | {"joints": joints * sign})
+        assert f"({robot.description.legs[i // count]}) slide at" in line
+        assert f"the sign of {name} is the other one" in line
+
+
+def test_a_leg_at_zero_is_named(tmp_path, planted):
+    robot, log = planted
+    legs = legs_of(robot, log).copy()
+    legs[:, 1] = 0.0
+    (line,) = legs_told(tmp_path, robot, log | {"joints": legs.reshape(log["joints"].shape)})
+    leg, count = robot.description.legs[1], robot.description.leg_joints
+    knee = robot.description.joints[2 * count - 1]
+    assert f"of the {leg} leg do not move" in line or f"{knee} do not move" in line
+
+
+def test_orders_of_four_legs_are_named_with_and_without_their_forces(tmp_path):
+    log = kinematic_log(QUADRUPED, 0.8)
+    for order in ([0, 2, 1, 3], [1, 0, 3, 2], [3, 1, 0, 2]):
+        told = f"in the order {', '.join(QUADRUPED.description.legs[i] for i in order)}"
+        told = "left and right legs are exchanged" if order == [1, 0, 3, 2] else told
+        for names in (("joints",), ("joints", "command.force", "command.moment", "contact")):
+            moved = {n: legs_of(QUADRUPED, log, n)[:, order].reshape(log[n].shape) for n in names}
+            (line,) = legs_told(tmp_path, QUADRUPED, log | moved)
+            assert told in line, line
+
+
+def test_what_is_late_is_named_by_the_shift_that_makes_feet_stand(tmp_path, planted):
+    robot, log = planted
+    late = lambda x, n: np.concatenate([np.repeat(x[:1], n, axis=0), x[:-n]])  # noqa: E731
+    for ms in (20, 40):
+        joints = {"joints": late(log["joints"], ms // 5)}
+        (line,) = legs_told(tmp_path, robot, log | joints)
+        assert f"joints are {ms} ms behind the state" in line
+        state = {n: late(x, ms // 5) for n, x in log.items() if n.startswith("state")}
+        (line,) = legs_told(tmp_path, robot, log | state)
+        assert f"the state is {ms} ms behind the joints" in line
+
+
+def test_angles_and_rates_in_the_other_order_are_guessed(tmp_path, planted):
+    robot, log = planted
+    turned = {n: x[..., ::-1] for n, x in log.items() if n.endswith(".euler")}
+    rates = {n: x[..., ::-1] for n, x in log.items() if n.endswith("ang_velocity")}
+    for changed in (turned, turned | rates):
+        try:
+            lines = legs_told(tmp_path, robot, log | changed)
+        except InputError as error:
+            lines = [str(error)]
+        assert "yaw, pitch, roll" in lines[-1], lines
+
+
+def test_forces_in_other_units_are_named(tmp_path, planted):
+    robot, log = planted
+    for unit, newtons in (("kN", 1e3), ("kgf", 9.81)):
+        force = {"command.force": log["command.force"] / newtons}
+        (line,) = legs_told(tmp_path, robot, log | force)
+        assert line == f"command.force bears the robot's weight if it is in {unit}: expected is N"
+
+
+def test_joints_that_never_move_and_entries_of_objects_are_refused(tmp_path, planted):
+    robot, log = planted
+    still = {"joints": np.tile(log["joints"][0], (400, 1))}
+    with pytest.raises(InputError, match="its joints never move: the log has no legs"):
+        found(tmp_path, log | still, robot)
+    walk = read_walk(tmp_path / "log.npz", robot, SECONDS, TICK)[0]
+    inputs = walk_config(robot), robot, nominal(robot), named_command("straight"), walk
+    with pytest.raises(InputError, match="its joints never move: the log has no legs"):
+        compare_plans(*inputs)
+    for name in ("joints", "torque"):
+        objects = np.full(log["joints"].shape, None, dtype=object)
+        with pytest.raises(InputError, match=f"{name} cannot be read: Object arrays"):
+            found(tmp_path, log | {name: objects}, robot)
+    half = {n: x[:200] for n, x in log.items() if np.ndim(x) and len(x) == 400}
+    with pytest.raises(InputError, match=r"too early to tell anything, it takes 1.5 s"):
+        found(tmp_path, log | half, robot, seconds=1.0)
+
+
 def test_what_tells_nothing_is_refused(tmp_path, sound):
     for change, told in (
         ({"torque": np.zeros((7, 3))}, r"torque must be numbers of shape \(2000, 10\), got float"),
@@ -153,16 +330,16 @@ def test_what_tells_nothing_is_refused(tmp_path, sound):
             found(tmp_path, sound | change)
     fallen = sound["state.position"].copy()
     fallen[1300:, 2] = 0.0
-    with pytest.raises(InputError, match="fell after 1.30 s: too early to tell anything"):
+    told = "fell after 1.30 s: too early to tell anything, it takes 2 s"
+    with pytest.raises(InputError, match=told):
         found(tmp_path, sound | {"state.position": fallen})
 
 
 @pytest.mark.slow  # twenty walks
 def test_of_twenty_sound_walks_at_most_one_is_blamed(tmp_path):
-    quadruped = load_robot(Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml")
     blamed = []
     for number in range(20):
-        robot = quadruped if number % 4 == 3 else ROBOT
+        robot = QUADRUPED if number % 4 == 3 else ROBOT
         traj, weights = COMMANDS[number % 3], (nominal, expert)[number % 2](robot)
         plant = named_world("hfs-varied", 480 + number, robot.description)
         plant = plant._replace(mass=np.ones_like(plant.mass))  # another mass is a fault

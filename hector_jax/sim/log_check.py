@@ -17,10 +17,10 @@ from hector_jax.control.reference import Command
 from hector_jax.core.geometry import euler_rates, rotation_from_euler
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import SOLVED, State, Trajectory
-from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.model import Robot
 from hector_jax.sim.diagnosis import FALLING, MOST_AT_LIMIT, STEADY, lasting, motors, steady_height
-from hector_jax.sim.walk_file import read_walk, reference_of
+from hector_jax.sim.leg_check import BETTER, legs_found, slope, span_of
+from hector_jax.sim.walk_file import check_legs, read_entries, read_walk, reference_of
 
 SETTLED, SHORTEST = 0.5, 1.0  # [s] after t = 0; of a walk from then on
 LOADED = 0.2  # share of the weight on a foot that stands
@@ -29,8 +29,8 @@ MASS, COMMANDED_MASS = 0.05, 0.15  # share of the weight, by the ground and by t
 LONGEST, LATE = 0.06, 0.015  # [s] delays of the ground's force that are tried; largest usual one
 GAIN = 0.15  # of the ground's force by the commanded one, from 1
 IN_AIR = 0.02  # share of the weight
-SLIDING, BETTER = 0.25, 0.5  # [m/s] of feet that stand; share of it that names a cause
 UNLIKE = 0.3  # of a velocity, from the derivative of what it is the velocity of
+UNITS = {"kN": 1000.0, "kgf": 9.81}  # [N]
 FOLLOWS = 0.3  # of the robot's distance from the path, that is left to a reference that follows it
 
 
@@ -45,6 +45,7 @@ class CheckedLog(NamedTuple):
     stance: Bool[np.ndarray, "n feet"]  # planned contact if it can be trusted, else commanded load
     # share of samples and feet whose planned contact is not that of the load; None without contact
     astray: float | None
+    units: dict[str, str]  # of `command` and `effect` where it is not N, in which `walk` has them
 
     @property
     def weight(self) -> float:
@@ -64,12 +65,14 @@ def read_check(
         tick: that of the gait [s].
 
     Raises:
-        InputError: see `read_walk`; or less than SHORTEST is left of the walk, or `torque` is not
-            numbers of that shape.
+        InputError: see `read_walk`; or less than SHORTEST is left of the walk, its joints never
+            move, or `torque` is not numbers of that shape.
     """
     whole, end = read_walk(path, robot, seconds, tick)
-    with np.load(path) as archive:
-        names, shape, torque = {*archive.files}, archive["joints"].shape, archive.get("torque")
+    check_legs(whole)
+    names = "joints", "torque", "contact", "effect.force", "reference.position"
+    rest = read_entries(path, names)
+    torque, shape = rest.get("torque"), rest["joints"].shape
     if torque is not None and (torque.shape != shape or torque.dtype.kind not in "iuf"):
         text = f"torque must be numbers of shape {shape}"
         raise InputError(f"{path}: {text}, got {torque.dtype} of shape {torque.shape}")
@@ -77,17 +80,27 @@ def read_check(
     rows = slice(round(SETTLED / period), count - round(FALLING / period) * bool(end))
     if rows.stop - rows.start < SHORTEST / period:
         ended = end or f"lasts {count * period:.2f} s"
-        raise InputError(f"{path}: {ended}: too early to tell anything")
+        needed = SETTLED + SHORTEST + FALLING * bool(end)
+        raise InputError(f"{path}: {ended}: too early to tell anything, it takes {needed:g} s")
     reference = jax.tree.map(np.asarray, reference_of(tick, robot, command, whole))
     cut = partial(jax.tree.map, lambda x: np.asarray(x)[rows])
-    own = cut(whole.reference) if "reference.position" in names else None
+    own = cut(whole.reference) if "reference.position" in rest else None
     walk = cut(whole._replace(period=None, initial=None, reference=reference))
     walk = walk._replace(period=whole.period, initial=whole.initial)
     share = None if torque is None else torque[rows] / np.asarray(robot.torque_limit)
-    loaded = walk.command.force[..., 2] > LOADED * float(robot.mass * robot.gravity[2])
-    astray = float(np.mean(walk.contact != loaded)) if "contact" in names else None
+    weight, units = float(robot.mass * robot.gravity[2]), {}
+    for name in ("command", "effect"):
+        wrench = getattr(walk, name)
+        carried = wrench.force[..., 2].sum(axis=1).mean() / weight
+        for unit, newtons in UNITS.items():
+            if abs(carried * newtons - 1.0) < UNLIKE:
+                units[name] = unit
+                walk = walk._replace(**{name: wrench._replace(force=newtons * wrench.force)})
+    loaded = walk.command.force[..., 2] > LOADED * weight
+    astray = float(np.mean(walk.contact != loaded)) if "contact" in rest else None
     stance = walk.contact if astray is not None and astray <= ASTRAY else loaded
-    return CheckedLog(robot, walk, own, share, "effect.force" in names, stance, astray), end
+    has_effect = "effect.force" in rest
+    return CheckedLog(robot, walk, own, share, has_effect, stance, astray, units), end
 
 
 def check_log(log: CheckedLog, tick: float) -> list[str]:
@@ -102,25 +115,32 @@ def check_log(log: CheckedLog, tick: float) -> list[str]:
             f"the commanded forces are {force:.0f} N upwards in the mean: expected are those of "
             "the ground on the robot, not those of the robot on the ground"
         ]
-    questions = _contacts, _velocities, _legs, _loads, _ground, _air, _torques, _reference, _plans
+    questions = (
+        _units,
+        _contacts,
+        _velocities,
+        _legs,
+        _loads,
+        _ground,
+        _air,
+        _torques,
+        _reference,
+        _plans,
+    )
     return [line for ask in questions for line in ask(log, tick)]
 
 
-def _span(period: float) -> int:
-    """Return the number of samples in about 20 ms."""
-    return max(round(0.02 / period), 2)
-
-
-def _slope(x: Float[np.ndarray, "n ..."], period: float) -> Float[np.ndarray, "m ..."]:
-    """Return derivatives, in the middle of each span."""
-    span = _span(period)
-    return (x[span:] - x[:-span]) / (span * period)
-
-
 def _middle(x: Float[np.ndarray, "n ..."], period: float) -> Float[np.ndarray, "m ..."]:
-    """Return the means over the spans of `_slope`."""
-    span, sums = _span(period), np.cumsum(x, axis=0)
+    """Return the means over the spans of `slope`."""
+    span, sums = span_of(period), np.cumsum(x, axis=0)
     return (sums[span:] - sums[:-span]) / span
+
+
+def _units(log: CheckedLog, tick: float) -> Iterator[str]:
+    """Are forces in N?"""
+    for name, unit in log.units.items():
+        if name == "command" or log.has_effect:
+            yield f"{name}.force bears the robot's weight if it is in {unit}: expected is N"
 
 
 def _contacts(log: CheckedLog, tick: float) -> Iterator[str]:
@@ -145,11 +165,11 @@ def _velocities(log: CheckedLog, tick: float) -> Iterator[str]:
         ("velocity", state.velocity, state.position, to_world(state.velocity)),
         ("ang_velocity", rates, state.euler, body_rates),
     ):
-        slope = _slope(true, period)
+        rate = slope(true, period)
 
-        def error(x: np.ndarray, slope: np.ndarray = slope) -> float:
-            away = np.sqrt(np.mean((_middle(x, period) - slope) ** 2))
-            return float(away / max(np.sqrt(np.mean(slope**2)), 0.05))
+        def error(x: np.ndarray, rate: np.ndarray = rate) -> float:
+            away = np.sqrt(np.mean((_middle(x, period) - rate) ** 2))
+            return float(away / max(np.sqrt(np.mean(rate**2)), 0.05))
 
         if (as_is := error(found)) <= UNLIKE:
             continue
@@ -157,61 +177,20 @@ def _velocities(log: CheckedLog, tick: float) -> Iterator[str]:
         unit, scale = ("mm/s", 1e-3) if name == "velocity" else ("degrees", np.pi / 180.0)
         guesses[f"it is in {unit}"] = error(scale * found)
         guesses["its sign is the other one"] = error(-found)
+        if name == "ang_velocity":
+            euler, back = state.euler[:, ::-1], state.ang_velocity[:, ::-1]
+            E_back = np.asarray(jax.vmap(euler_rates)(euler))
+            rates = np.einsum("tij,tj->ti", E_back, state.ang_velocity)
+            guesses["the angles are yaw, pitch, roll"] = error(rates, slope(euler, period))
+            guesses["its order is z, y, x"] = error(np.einsum("tij,tj->ti", E, back))
         guess = min(guesses, key=lambda words: guesses[words])
         cause = f": {guess}" if guesses[guess] < BETTER * as_is else ""
         yield f"{name} is {100 * as_is:.0f} % off the derivative of the pose{cause}"
 
 
-def _sliding(log: CheckedLog, joints: Float[np.ndarray, "n joints"]) -> tuple[float, float]:
-    """Return the speed of the feet that stand [m/s], RMS, and their mean height [m]."""
-    state, period, robot = log.walk.state, float(log.walk.period), log.robot
-    R = np.asarray(jax.vmap(rotation_from_euler)(state.euler))
-    local = np.asarray(jax.vmap(lambda q: foot_poses(robot, q).position)(joints))
-    feet = np.einsum("tij,tfj->tfi", R, local - np.asarray(robot.com_offset))
-    feet = feet + state.position[:, None]
-    span = _span(period)
-    windows = np.lib.stride_tricks.sliding_window_view(log.stance, 2 * span + 1, axis=0)
-    standing = np.asarray(windows.all(axis=-1))
-    speed = np.linalg.norm(_slope(feet, period), axis=-1)
-    inner = speed[span // 2 :][: len(standing)][standing]
-    height = float(feet[log.stance, 2].mean()) if log.stance.any() else 0.0
-    return float(np.sqrt(np.mean(inner**2))) if len(inner) else 0.0, height
-
-
 def _legs(log: CheckedLog, tick: float) -> Iterator[str]:
     """Do feet that stand stay where the joints say that they are?"""
-    joints, legs = log.walk.joints, log.stance.shape[1]
-    by_leg = joints.reshape(len(joints), legs, -1)
-    speed, height = _sliding(log, joints)
-    names = log.robot.description.joints[: by_leg.shape[2]]
-    if speed > SLIDING:
-        guesses: dict[str, np.ndarray] = {
-            "left and right legs are exchanged": by_leg.reshape(
-                len(joints), -1, 2, by_leg.shape[2]
-            )[:, :, ::-1],
-            "the joints of a leg are in the order from the foot up": by_leg[:, :, ::-1],
-        }
-        if np.abs(joints).max() > 2.0 * np.pi:
-            guesses = {"they are in degrees": np.radians(by_leg)}
-        for i, name in enumerate(names):
-            signs = np.where(np.arange(len(names)) == i, -1.0, 1.0)
-            guesses[f"the sign of {name} and its likes is the other one"] = by_leg * signs
-        for i in range(len(names) - 1):
-            order = [*range(i), i + 1, i, *range(i + 2, len(names))]
-            guesses[f"{names[i]} and {names[i + 1]} are exchanged"] = by_leg[:, :, order]
-        speeds = {x: _sliding(log, q.reshape(len(joints), -1))[0] for x, q in guesses.items()}
-        guess = min(speeds, key=lambda words: speeds[words])
-        slides = f"by the joints, feet that stand slide at {speed:.2f} m/s"
-        if speeds[guess] < BETTER * speed:
-            yield f"{slides}: {guess}"
-        elif speed > 2.0 * SLIDING:
-            yield f"{slides}: they slip, or joints are wrong in the log"
-    elif abs(height) > STEADY:
-        side = "above" if height > 0.0 else "below"
-        yield (
-            f"by the joints, feet that stand are {100 * abs(height):.1f} cm {side} the floor: foot "
-            "point, leg length or height of the centre of mass in the robot's file"
-        )
+    yield from legs_found(log.robot, log.walk, log.stance)
 
 
 def _loads(log: CheckedLog, tick: float) -> Iterator[str]:

@@ -20,6 +20,7 @@ from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import SOLVED, Trajectory, Wrench
 from hector_jax.robot.model import Robot
+from hector_jax.sim.walk_file import check_legs
 
 COMPONENTS = ("F_x", "F_y", "F_z", "M_x", "M_y", "M_z")
 
@@ -61,8 +62,9 @@ def compare_plans(
             before t = 0 are not in the plans.
 
     Raises:
-        InputError: the walk is shorter than two plans.
+        InputError: the walk is shorter than two plans, or its joints never move.
     """
+    check_legs(walk)
     per_tick = round(config.gait.tick / float(walk.period))
     every = per_tick * config.twin.plan_ticks
     rows = np.arange(every, int(np.sum(~walk.fallen)), every)

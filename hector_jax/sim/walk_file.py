@@ -5,6 +5,7 @@ An .npz with entries named like those of a `Trajectory`, such as `state.euler` (
 command, and all else zero: no fall, solved plans.
 """
 
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 
 _NEEDED = ("initial.", "state.", "command.", "joints")
+UPRIGHT = 0.9  # share of the standing height above which no robot lies or falls
 FLAGS = ("contact", "fallen", "legs_touch")
 """Entries of zeros and ones."""
 
@@ -46,6 +48,11 @@ def read_walk(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Tr
     min_height, max_tilt = robot.description.limits
     tilt = np.abs(walk.state.euler[:valid, :2]).max(axis=1)
     tilt = np.where(walk.state.position[:valid, 2] >= min_height, tilt, 0.0)  # of an upright trunk
+    tall = walk.state.position[:valid, 2] >= UPRIGHT * float(robot.standing_height)
+    roll, pitch, yaw = np.abs(walk.state.euler[:valid]).max(axis=0, initial=0.0)
+    if tall.all() and max(pitch, yaw) < max_tilt < roll:
+        text = f"roll reaches {roll:.3g} at full height and yaw stays small"
+        raise InputError(f"{path}: {text}, expected roll, pitch, yaw: is it yaw, pitch, roll?")
     if tilt.max(initial=0.0) > np.pi or (tilt[:1] > max_tilt).any():
         text = f"roll or pitch reaches {tilt.max():.3g} at full height"
         raise InputError(f"{path}: {text}, expected radians")
@@ -68,6 +75,31 @@ def read_walk(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Tr
     ), end
 
 
+def read_entries(path: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """Return those of the named entries that a log has; others, of any kind, are not read.
+
+    Raises:
+        InputError: one line: the file is no archive, or an entry is broken or holds objects.
+    """
+    name = ""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            found = {}
+            for name in [x for x in names if x in archive.files]:
+                found[name] = archive[name]
+            return found
+    except Exception as error:  # a foreign archive can fail in any way
+        text = f"{name} cannot be read" if name else "not a log (.npz)"
+        raise InputError(f"{path}: {text}: {one_line(error)}") from None
+
+
+def check_legs(walk: Trajectory) -> None:
+    """Raise an InputError if no joint of a walk ever moves."""
+    if not np.ptp(walk.joints, axis=0).any():
+        text = "the log has no legs, as that of a rigid body (--world srbm)"
+        raise InputError(f"its joints never move: {text}")
+
+
 def _entries(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Trajectory, int, int]:
     """Return the entries of a file; see `read_walk`.
 
@@ -75,11 +107,8 @@ def _entries(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Tra
         The samples of the file, the number of those before the state is no number, and the number
         of samples that were expected.
     """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files if name != "card"}
-    except Exception as error:  # a foreign archive can fail in any way
-        raise InputError(f"{path}: not a log (.npz): {one_line(error)}") from None
+    empty = no_samples(len(robot.joint_lower), len(robot.foot_point))
+    arrays = read_entries(path, named_leaves(empty))
     asked = "" if "period" in arrays else "; is period missing?"
     arrays = {"period": np.array(TIME_STEP)} | arrays
     if not _divides(period := arrays["period"], tick):
@@ -91,7 +120,7 @@ def _entries(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Tra
     if not 1 <= count <= wanted:
         expected = f"{wanted} samples of joints in {seconds:g} s of {period:g} s"
         raise InputError(f"{path}: expected {expected}, got {count}{asked}")
-    walk = _checked(path, arrays, no_samples(len(robot.joint_lower), len(robot.foot_point)), count)
+    walk = _checked(path, arrays, empty, count)
     finite = np.all([np.isfinite(x).all(axis=1) for x in walk.state], axis=0)
     valid = count if finite.all() else int(np.argmin(finite))
     for name, x in named_leaves(walk).items():
