@@ -284,8 +284,8 @@ class Verdict(Configured, ForRobot, ByWalker, Parallel, Printed):
     light_heavy: bool = False  # also the robot's own model with masses times 0.9 and 1.1
     family: Family = "standin"  # of the plants; even: masses drawn evenly about the nominal ones
     seeds: Plants = 8  # number of plants of the robot's own model, in the first engine
-    model_seeds: Plants = 4  # number of plants of each other model, in the first engine
-    engine_seeds: Plants = 4  # number of plants of each model in each further engine
+    model_seeds: Plants = 8  # number of plants of each other model, in the first engine
+    engine_seeds: Plants = 8  # number of plants of each model in each further engine
     first_seed: Seed = 0  # first plant
     seconds: Seconds = 4.0  # length of each walk [s]; a whole eight takes 8
     out: Folder = Path("runs/verdict")  # folder for the report; a later call continues there
