@@ -1,6 +1,8 @@
 """What the pages say is so: examples run, commands parse, each figure is that of its file."""
 
 import ast
+import collections
+import contextlib
 import doctest
 import functools
 import importlib
@@ -13,6 +15,7 @@ import shlex
 import subprocess
 import sys
 import tomllib
+from dataclasses import fields
 from pathlib import Path
 from unittest import mock
 
@@ -112,6 +115,112 @@ def test_commands_of_a_page_parse_and_what_it_names_is_there(path, capsys):
     for name, test, more in re.findall(r"(test_\w+)\.py(?:::(test_\w+)(\.\.\.)?)?", text):
         tests = (ROOT / "tests" / f"{name}.py").read_text()
         assert f"def {test}" + ("" if more or not test else "(") in tests, (name, test)
+
+
+# Flags, sections, files and names, wherever they are told
+
+PACKAGE = ROOT / "hector_jax"
+FOREIGN = {"help", "tyro-print-completion", "no-NAME", "nworkers", "nthreads", "inplace", "xla"}
+TABLES = {"feet", "joints", "limits", "loss", "plants", "slip", "tuning", "twin", "weights"}
+TABLES |= {"footstep", "gait", "legs", "mpc"}  # of a robot's file
+MEANS = {"footstep": "FootstepConfig", "gait": "GaitConfig", "legs": "LegConfig"}
+MEANS |= {"mpc": "MpcConfig", "slip": "SlipConfig", "tuning": "TuningSettings"}
+MEANS |= {"effect": "Wrench", "contact": "Wrench", "reference": "State", "weights": "Weights"}
+
+
+def sentences():
+    """Files with what they tell: pages, templates, texts and comments of the code."""
+    for path in [*READ, *sorted(PACKAGE.rglob("*.j2"))]:
+        yield path, [path.read_text()]
+    for path in sorted(PACKAGE.rglob("*.py")):
+        text = path.read_text()
+        nodes = ast.walk(ast.parse(text))
+        told = [x.value for x in nodes if isinstance(x, ast.Constant) and isinstance(x.value, str)]
+        comments = re.findall(r"(?:^ *#.*\n)+|#.*$", text, re.MULTILINE)
+        yield path, told + [comment.replace("#", " ") for comment in comments]
+
+
+@functools.cache
+def known_flags():
+    """Of `hector`, and of the scripts."""
+    known = {flag.name for command in flags.COMMANDS.values() for flag in fields(command)}
+    for path in [*ROOT.glob("experiments/*.py"), *ROOT.glob("benchmarks/*.py")]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef):
+                known |= {x.target.id for x in node.body if isinstance(x, ast.AnnAssign)}
+            elif isinstance(node, ast.FunctionDef):
+                known |= {x.arg for x in (*node.args.args, *node.args.kwonlyargs)}
+    return {name.replace("_", "-") for name in known}
+
+
+@functools.cache
+def names_inside():
+    """Names that modules and classes of the package have, by the last part of theirs."""
+    inside = collections.defaultdict(set)
+    for path in PACKAGE.rglob("*.py"):
+        inside[path.parent.name].add(path.stem)
+        tree = ast.parse(path.read_text())
+        for node in (tree, *(x for x in ast.walk(tree) if isinstance(x, ast.ClassDef))):
+            module = path.parent.name if path.stem == "__init__" else path.stem
+            names = inside[getattr(node, "name", module)]
+            for child in node.body:
+                targets = getattr(child, "targets", [getattr(child, "target", child)])
+                names |= {getattr(x, "name", getattr(x, "id", "")) for x in targets}
+                names |= {x.asname or x.name for x in getattr(child, "names", []) if x != "*"}
+    return inside
+
+
+def is_there(name):
+    """Tell whether `a.b` is of a module or class, a robot's file, a log or a file that is written.
+
+    What begins with a name that is none of ours may be anything.
+    """
+    first, second, *_ = name.split(".")
+    inside = names_inside()
+    if first == "hector_jax":
+        with contextlib.suppress(AttributeError, ImportError):
+            return pkgutil.resolve_name(name) is not None
+        return False
+    if first not in inside.keys() | MEANS.keys():
+        return True
+    if second in inside.get(first, set()) | inside.get(MEANS.get(first, ""), set()):
+        return True
+    code = (path.read_text() for path in PACKAGE.rglob("*.py"))
+    word = re.escape(second if first == "loss" else name)
+    return any(re.search(rf"[\"/]{word}\"", text) for text in code)
+
+
+def test_flags_sections_files_and_names_that_anything_tells_are_there():
+    missing = []
+    for path, texts in sentences():
+        for text in texts:
+            told = set(re.findall(r"(?<![\w-])--([a-z](?:[a-zA-Z-]*[a-zA-Z])?)", text)) - FOREIGN
+            told = {flag for flag in told if flag.removeprefix("no-") not in known_flags()}
+            if path.name != "environment.py":  # which asks git
+                missing += [(path.name, f"--{flag}") for flag in told]
+            heads = re.findall(r"`\[(\w+)\]`", text)
+            missing += [(path.name, x) for x in heads if x not in TABLES]
+            folders = "docs|hector_jax|tests|experiments|examples|assets|benchmarks"
+            files = re.findall(rf"\b(?:{folders})/[\w/.-]*\w\.\w+", text)
+            missing += [(path.name, file) for file in files if not (ROOT / file).exists()]
+            names = re.findall(r"`((?:[a-zA-Z]\w*\.)+[a-zA-Z]\w*)`", text)
+            missing += [(path.name, name) for name in names if not is_there(name)]
+    assert missing == []
+
+
+def test_a_page_that_code_cites_has_words_of_the_sentence_that_cites_it():
+    """A third of the long ones at least; an ending may differ."""
+    cited = 0
+    for path, texts in sentences():
+        for text in texts if path.suffix == ".py" else ():
+            for found in re.finditer(r"docs/[\w/-]+\.md", text):
+                sentence = re.split(r"\.\s|\n\n", text[: found.start()])[-1]
+                long = {word[:6].lower() for word in re.findall(r"[A-Za-z]{6,}", sentence)}
+                page = (ROOT / found.group()).read_text().lower()
+                there = [word for word in long if word in page]
+                assert 3 * len(there) >= len(long), (path.name, found.group(), long - set(there))
+                cited += 1
+    assert cited > 5
 
 
 def slugs(path):
