@@ -51,7 +51,7 @@ PACKAGES = {  # in this order: title and purpose of each page of the reference
     "sim": ("Simulation", "The robot in MuJoCo, one walk at a time or in batches."),
     "grfm": ("Ground reaction net", "phi: the map from command to effect, its data and training."),
     "tuning": ("Tuning", "Rollout, loss and Gauss-Newton steps, for one problem or for many."),
-    "search": ("Search", "Tuning by walks on a simulator, without derivatives."),
+    "search": ("Search", "Tuning by walks, without derivatives or with those of a model."),
     "store": ("Store", "What is computed once and kept: walks, nets, tunings, runs."),
     "verdict": ("Verdict", "Walks of weight sets, scores and their statistics."),
     "importing": ("Importing", "The settings of robots that others publish, by rules."),

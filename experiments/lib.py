@@ -9,6 +9,8 @@ from typing import Any, TypeVar
 
 import jax
 import numpy as np
+from jaxtyping import Shaped
+from scipy import stats
 
 from hector_jax.control.weights import Weights, direction_names, scale_weights
 from hector_jax.core.console import bar
@@ -19,9 +21,12 @@ from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree import stack
 from hector_jax.robot.model import Robot
 from hector_jax.store.cache import content_key, load_or_make
+from hector_jax.verdict.metrics import COVERAGE, Interval
 
 Tree = TypeVar("Tree")
 Walk = TypeVar("Walk")  # a job, or what else is walked
+
+RESAMPLES, FEWEST = 10_000, 4  # resamples of a bootstrap; fewest samples for an interval
 
 
 def write_report(
@@ -122,6 +127,32 @@ def walk_groups(
 
     about = {"settings": [repr(part) for part in settings]}
     return load_or_make(paths, make, like=lambda _: like, kind=kind, robot=robot, about=about)
+
+
+def bootstrap(statistic: Callable[..., Any], *samples: Shaped[np.ndarray, "n ..."]) -> Interval:
+    """Compute a statistic with its percentile bootstrap interval, reproducibly.
+
+    With few samples it is too narrow: of 8, a median's covers 92 %, a mean's 86 %.
+
+    Args:
+        statistic: function of arrays like `samples`, possibly with leading axes.
+        samples: arrays to resample along their first axis, all with the same rows.
+
+    Returns:
+        The value and the interval, whose ends are NaN for fewer than `FEWEST` samples.
+    """
+    value, count = float(statistic(*samples)), len(samples[0])
+    if count < FEWEST:
+        return Interval(value, np.nan, np.nan)
+    ends = stats.bootstrap(
+        (np.arange(count),),  # rows, so that all arrays are resampled in the same way
+        lambda rows, axis: statistic(*(x[rows] for x in samples)),
+        n_resamples=RESAMPLES,
+        confidence_level=COVERAGE,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    return Interval(value, float(ends.low), float(ends.high))
 
 
 def all_devices() -> None:

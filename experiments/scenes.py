@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from changes import TRUNK_TOP, Change
+from lib import bootstrap
 from scipy.stats import binom
 
 from hector_jax.control.gait import GaitConfig
@@ -26,7 +27,7 @@ from hector_jax.report.report import markdown_table
 from hector_jax.robot.description import HECTOR, PlantSizes
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import NO_PUSH, Imperfections, Push, noisy
-from hector_jax.verdict.metrics import Interval, Score, bootstrap, falls_comparable
+from hector_jax.verdict.metrics import Interval, Score, falls_comparable
 
 DIRECTIONS = 45 * np.arange(8)  # [deg] of the pushes, from ahead to the left
 PUSH_START, PUSH_TIME, PUSH_WALK = 0.8, 0.1, 2.5  # [s] the walk includes the recovery

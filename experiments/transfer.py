@@ -49,7 +49,7 @@ from hector_jax.tuning.difftune import TuneConfig, step_status, tune_step
 from hector_jax.tuning.loss import PAPER_LOSS, loss_of
 from hector_jax.tuning.rollout import Scenario
 from hector_jax.tuning.status import StepStatus
-from hector_jax.verdict.metrics import Interval, bootstrap
+from hector_jax.verdict.metrics import Interval
 
 STEP = float(np.log(1.05))  # of the central differences, in log-weights
 
@@ -115,7 +115,7 @@ def compare(model: Gradients, simulator: Gradients) -> Row | None:
     distances = (a - b) ** 2  # sums to 2 (1 - cosine)
     worst = int(np.argmax(distances))
     share = float(distances[worst] / max(distances.sum(), 1e-12))
-    cosine = bootstrap(_cosine, model, simulator)
+    cosine = lib.bootstrap(_cosine, model, simulator)
     return Row(cosine, direction_names()[worst], share, int(finite.sum()))
 
 

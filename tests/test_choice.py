@@ -1,5 +1,6 @@
 """The set `best` of a run: its settings, and which point of the path of its tuning it is."""
 
+import itertools
 from concurrent.futures import Executor
 from types import SimpleNamespace
 
@@ -29,18 +30,22 @@ def test_start_quarter_half_and_end_of_the_accepted_path_walk():
 @pytest.mark.parametrize("winner", ["set 0", "set 2"])
 def test_the_set_that_walks_best_on_drawn_plants_is_taken(monkeypatch, capsys, winner):
     def judge(setup, sets, command, plants, seeds, **notes):
-        tuned_on = choice.drawn_plants(ROBOT, 1000)  # the most of --walk-plants
-        assert not {float(plant.mass) for plant in plants} & {float(p.mass) for p in tuned_on}
+        walked.append({float(plant.mass) for plant in plants})
         scale = 1.0 if command is straight else 100.0
         scores = {name: [pretend_score(scale * losses[name])] * len(plants) for name in sets}
         return SimpleNamespace(scores=scores)
 
     instead(monkeypatch, judging, "judge", judge)
+    walked = []
     losses = {"set 0": 1.0, "set 1": 0.9, "set 2": 1.1, "set 3": 2.0, winner: 0.5}
     setup, sets = Setup(Executor(), CONFIG, ROBOT), dict.fromkeys(losses, nominal())
     straight, turning = map(named_command, ("straight", "c"))
-    best = choice.walks_best(setup, sets, (straight, turning), 3, seconds=4.0, folder=None)
-    assert best == winner
+    for plants in (3, choice.HELD_OUT):  # after a tuning, and after walks
+        best = choice.walks_best(setup, sets, (straight, turning), plants, seconds=4.0, folder=None)
+        assert best == winner
+    tuned_on = {float(plant.mass) for plant in choice.drawn_plants(ROBOT, 1000)}  # the most
+    assert [len(plants) for plants in walked] == [3, 3, 8, 8]
+    assert not any(a & b for a, b in itertools.combinations((tuned_on, *walked[::2]), 2))
     said = capsys.readouterr().err
     assert f"best: {winner} of set 0 to set 3 walks best on 3 plants drawn around the hfs" in said
 

@@ -40,7 +40,7 @@ def test_auto_is_mjx_where_there_is_an_accelerator(monkeypatch):
 
 def test_an_engine_that_is_not_installed_says_what_to_install(monkeypatch):
     monkeypatch.setitem(ENGINES, "drake", ENGINES["drake"]._replace(package="no-such-package"))
-    with pytest.raises(InputError, match=r"no-such-package, .*: pip install 'hector-jax\[drake\]'"):
+    with pytest.raises(InputError, match=r"no-such-package, .*: pip install -e '.\[drake\]'"):
         choose_engine("drake")
 
 

@@ -11,10 +11,6 @@ from hector_jax.tuning.loss import PAPER_LOSS
 from hector_jax.verdict import metrics
 
 
-def mean_of(x):
-    return x.mean(axis=-1)
-
-
 def _judge(scenes=("s",), **losses):
     """A verdict of losses by plant, the same in each of the scenes."""
     scores = {name: [pretend_score(x) for x in row] for name, row in losses.items()}
@@ -37,20 +33,29 @@ def test_rms_errors_are_per_axis_and_a_fall_is_charged_but_not_in_them():
     assert np.isfinite(fell.rms_position).all()
 
 
-def test_bootstrap_intervals_cover_the_mean_about_as_often_as_they_say():
-    draws = np.random.default_rng(5).normal(size=(100, 32))
-    inside = [i.low < 0 < i.high for i in (metrics.bootstrap(mean_of, x) for x in draws)]
-    assert 0.86 <= np.mean(inside) <= 1.0
-    found = metrics.bootstrap(mean_of, draws[0])
-    assert found == metrics.bootstrap(mean_of, draws[0])
-    assert found.value == pytest.approx(draws[0].mean())
+@pytest.mark.parametrize("plants", [6, 8, 16])
+def test_intervals_of_few_plants_cover_what_they_say_and_seldom_claim_what_is_not(plants):
+    draws = np.random.default_rng(5).lognormal(sigma=0.2, size=(4000, plants))
+    error = 3 * np.sqrt(0.95 * 0.05 / len(draws))  # of the shares below
+    medians, means = (
+        [interval_of(row) for row in draws]
+        for interval_of in (metrics.interval_of_median, metrics.interval_of_mean)
+    )
+    for found, true in ((medians, 1.0), (means, np.exp(0.2**2 / 2))):
+        assert np.mean([x.low <= true <= x.high for x in found]) >= 0.95 - error
+    assert np.mean([x.high < 1.0 for x in medians]) <= 0.025 + error  # a gain where there is none
+    ordered = np.sort(draws[0])
+    rank = {6: 0, 8: 0, 16: 3}[plants]
+    assert medians[0][1:] == (ordered[rank], ordered[-1 - rank])
+    assert means[0].value == pytest.approx(draws[0].mean())
 
 
-def test_fewer_than_four_samples_have_no_interval():
-    for count in (1, 2, 3):
-        found = metrics.bootstrap(mean_of, np.arange(1.0, count + 1))
-        assert found.value == (count + 1) / 2
-        assert np.isnan([found.low, found.high]).all()
+def test_fewer_than_six_plants_have_no_interval():
+    for count in range(1, 6):
+        for interval_of in (metrics.interval_of_median, metrics.interval_of_mean):
+            found = interval_of(np.arange(1.0, count + 1))
+            assert found.value == (count + 1) / 2
+            assert np.isnan([found.low, found.high]).all()
     verdict = _judge(nominal=[1.0], tuned=[0.5])
     found = json.loads(as_json(metrics.verdict_result(verdict)))["sets"]["tuned"]["standin"]
     assert found["L"] == {"mean": 0.5, "low": None, "high": None}
@@ -59,7 +64,7 @@ def test_fewer_than_four_samples_have_no_interval():
 
 
 def test_the_change_is_the_median_of_paired_ratios_not_the_ratio_of_means():
-    verdict = _judge(nominal=[1.0, 10.0, 10.0, 100.0], tuned=[0.5, 8.0, 8.0, 99.0])
+    verdict = _judge(nominal=[1.0, *[10.0] * 4, 100.0], tuned=[0.5, *[8.0] * 4, 99.0])
     change = metrics.compare(verdict, "tuned", "nominal").change["L"]
     assert change.value == pytest.approx(-20.0)
     assert change.low == pytest.approx(-50.0)
@@ -71,9 +76,12 @@ def test_an_interval_over_trajectories_is_one_over_plants():
     losses = 1.0 + 0.1 * rng.normal(size=(8, 1)) + 0.03 * rng.normal(size=(8, 3))
     walks = {s: {"tuned": [pretend_score(x) for x in losses[:, i]]} for i, s in enumerate("abc")}
     found = metrics.mean(metrics.make_verdict(PAPER_LOSS, range(8), walks), "tuned")
-    plants = metrics.bootstrap(mean_of, losses.mean(axis=1))
-    assert found == pytest.approx(plants, rel=1e-9)
+    assert found == pytest.approx(metrics.interval_of_mean(losses.mean(axis=1)), rel=1e-9)
     assert found.low < found.value < found.high
+    base = {s: row | {"nominal": [pretend_score(1.0)] * 8} for s, row in walks.items()}
+    change = metrics.compare(metrics.make_verdict(PAPER_LOSS, range(8), base), "tuned", "nominal")
+    expected = metrics.interval_of_median(100 * (np.median(losses, axis=1) - 1))
+    assert change.change["L"] == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize(

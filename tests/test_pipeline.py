@@ -23,6 +23,7 @@ from hector_jax.grfm import dataset
 from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import load_robot
+from hector_jax.search.few_walks import space_of
 from hector_jax.sim.engine import ENGINES
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
@@ -128,8 +129,13 @@ def test_several_losses_count_alike_without_drawn_models_with_which_the_start_fa
     problem = tunings.Problem(tuple(commands), None, draws)
     setup = Setup(ThreadPoolExecutor(2), TuneConfig(), ROBOT)
     found = tunings.relative_matrix(setup, nominal(), problem)
-    np.testing.assert_allclose(found, np.mean(1.0 / np.array(counted)) * np.eye(18))
     said = " ".join(capsys.readouterr().err.split())
+    if draws and not stand:  # a fall tells no curvature
+        assert "at the start is not known: on the model the robot fell" in said
+        space = space_of(found, np.array([[-1.0, 1.0]] * 18))
+        np.testing.assert_array_equal(space.to_steps, np.eye(18))
+    else:
+        np.testing.assert_allclose(found, np.mean(1.0 / np.array(counted)) * np.eye(18))
     told = "1 of 3 drawn models left out of the tuning: the weights at the start fall"
     assert (told in said) == (stand == 2)
 

@@ -82,17 +82,21 @@ def test_the_table_has_a_row_for_each_set_and_marks_a_comparison_that_falls_make
 def test_walks_are_not_counted_as_plants_and_one_plant_has_no_interval(tmp_path):
     verdict = pretend_verdict(4, {("with", 0)}, scenes=("straight", "c", "s"))
     first, second, *_ = report.legend(verdict)
-    assert first.endswith("; means over 4 plants and 3 trajectories (seeds 0-3).")
-    assert "median over plants and trajectories of the paired ratio" in second
-    assert "intervals redraw the plants" in second
+    seeds = "seeds 0-3; those below 32 served development"
+    assert first.endswith(f"; means over 4 plants and 3 trajectories ({seeds}).")
+    assert "of the paired ratio, of each plant the median over its trajectories; below" in second
+    assert second.endswith("; no interval from fewer than 6 plants.")
     text = written(tmp_path, verdict)
     assert "the robot fell in 3 of 12 walks (4 plants, 3 trajectories)." in text
     assert "| 3 / 12 |" in text
     assert "12 plants" not in text
     one = pretend_verdict(1)
     first, second, *_ = report.legend(one)
-    assert "means over 1 plant (seed 0)." in first
-    assert "interval" not in second
+    assert "means over 1 plant (seed 0; " in first
+    assert "[95 % interval]" not in second
+    fresh = report.legend(pretend_verdict(6)._replace(seeds=np.arange(32, 38)))
+    assert "(seeds 32-37)." in fresh[0]
+    assert "paired ratio [95 % interval]; below zero is better." in fresh[1]
     for text in (printed(one), report.render("verdict.md.j2", verdict=one)):
         assert not re.search(r"1 plants|seeds 0|\d \[[+-]?\d", text)
 

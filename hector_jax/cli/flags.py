@@ -186,7 +186,8 @@ class Tune(Configured, ByWalker, Parallel):
     alpha: Literal["paper", "auto"] = "paper"  # loss weights; auto makes the gradient norms alike
     # price in `best` of changes of the command between switches of stance: more, smoother commands
     smooth: Annotated[float, Range(0, 1000)] = 3.0
-    # limit [m] of the position error in the MPC of `best`; by default 0.19 of the robot's height
+    # limit [m] of the position error in the MPC of `best`; by default 0.19 of the height of its
+    # centre of mass
     safe: Annotated[float | None, Range(0.001, 10)] = None
     data: Folder = Path("data")  # folder of the walks and the net, which are made if missing
     net: Annotated[Path | None, PathKind.FILE] = None  # another net, instead of that in DATA
@@ -284,8 +285,8 @@ class Verdict(Configured, ForRobot, ByWalker, Parallel, Printed):
     light_heavy: bool = False  # also the robot's own model with masses times 0.9 and 1.1
     family: Family = "standin"  # of the plants; even: masses drawn evenly about the nominal ones
     seeds: Plants = 8  # number of plants of the robot's own model, in the first engine
-    model_seeds: Plants = 4  # number of plants of each other model, in the first engine
-    engine_seeds: Plants = 4  # number of plants of each model in each further engine
+    model_seeds: Plants = 8  # number of plants of each other model, in the first engine
+    engine_seeds: Plants = 8  # number of plants of each model in each further engine
     first_seed: Seed = 0  # first plant
     seconds: Seconds = 4.0  # length of each walk [s]; a whole eight takes 8
     out: Folder = Path("runs/verdict")  # folder for the report; a later call continues there

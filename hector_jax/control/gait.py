@@ -103,6 +103,8 @@ def gait_named(config: GaitConfig, name: str) -> GaitConfig:
     if name == STAND:
         return replace(config, stance=config.cycle, swing=0)
     gaits = [gait for gait, leads in PATTERNS.items() if len(leads) == len(config.offsets)]
+    if name in PATTERNS and name not in gaits:
+        raise InputError(f"{name} is for {len(PATTERNS[name])} legs, not {len(config.offsets)}")
     if name not in gaits:
         raise InputError(unknown("gait", name, [*gaits, STAND]))
     duty = _DUTY.get(name, 0.5)

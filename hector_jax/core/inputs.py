@@ -24,7 +24,9 @@ class InputError(ValueError):
 def require_package(package: str, extra: str, what: str, hint: str = "") -> None:
     """Raise an InputError unless the package of an extra, which `what` needs, is installed."""
     if find_spec(package) is None:
-        raise InputError(f"{what} needs {package}: pip install 'hector-jax[{extra}]'{hint}")
+        raise InputError(
+            f"{what} needs {package}: pip install -e '.[{extra}]' in the checkout{hint}"
+        )
 
 
 @contextmanager

@@ -18,7 +18,7 @@ of mass m and height h:
                              (`response`); at most 2 / rad times the torque limit
     kd                       sqrt(kp I)
     inertia_share            that share which leaves the plan's attitude the same phase margin
-    Q                        HECTOR's
+    Q                        HECTOR's; for nominal 250 on the height
     R of forces, moments     times (m0 / m)^2, (m0 h0 / (m h))^2; for nominal times 0.3 as well
     L_ctrl                   times (m0 / m)^2
     lead                     one gait cycle in place before the command of a rollout

@@ -17,7 +17,6 @@ from hector_jax.verdict.matrix import OWN, Cells, Column
 from hector_jax.verdict.metrics import BASELINES, FEWEST, Interval, compare
 
 TITLES = {name: engine.title for name, engine in ENGINES.items()}
-_COARSE = 8  # with fewer plants, intervals are coarse
 LEARNED_FROM = ("c", "mjx")  # engines whose walks train the nets and serve the searches
 
 
@@ -70,7 +69,6 @@ def claims(cells: Cells, differs: Mapping[str, str], family: str) -> dict[str, l
         seeds=list(map(seeds_text, seeds.values())),
         engines=list(dict.fromkeys(column.engine for column in seeds)),
         models=list(dict.fromkeys(column.model for column in seeds)),
-        coarse=[c for c, drawn in seeds.items() if FEWEST <= len(drawn) < _COARSE],
         few=[c for c, drawn in seeds.items() if len(drawn) < FEWEST],
         differs=differs,
         family=family,

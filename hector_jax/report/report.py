@@ -149,7 +149,7 @@ def legend(verdict: Verdict) -> list[str]:
         "legend.txt.j2",
         verdict=verdict,
         seeds=seeds_text(verdict.seeds),
-        has_intervals=len(verdict.seeds) >= metrics.FEWEST,
+        fewest=metrics.FEWEST,
         mark=None if all(comparison.counts for comparison in comparisons) else VOID,
     )
     return text.splitlines()

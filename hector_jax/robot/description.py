@@ -21,7 +21,8 @@
     [tuning]                           # fields of TuningSettings
     [plants]                           # fields of PlantSizes
 
-The model must be named; all other defaults are those of assets/hector.toml. Masses, lengths, joint
+The model must be named; all other defaults are those of assets/hector.toml,
+but without [slip] the controller does not react to slips. Masses, lengths, joint
 and torque limits come from the model; a description is a static field of its `Robot` under jit.
 """
 

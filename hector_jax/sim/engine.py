@@ -3,13 +3,13 @@
 An engine is chosen once, by `choose_engine`, and passed down.
 """
 
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import redirect_stdout
 from functools import partial
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
+from io import StringIO
 from typing import NamedTuple
 
 import jax
@@ -118,7 +118,7 @@ def _walk_mjx(
     exact: bool = True,
     batch: int = 0,
 ) -> Iterator[Trajectory]:
-    with redirect_stdout(sys.stderr):  # MJX takes a second to import and prints missing packages
+    with redirect_stdout(StringIO()):  # MJX takes a second to import and prints missing packages
         from hector_jax.sim.parallel import walk_batch
 
     padded = [*jobs, *list(jobs[-1:]) * (batch - len(jobs))]
@@ -145,8 +145,8 @@ def choose_engine(name: str) -> Engine:
     if engine.version is None:
         raise InputError(
             f"engine {name} needs {engine.package}, which is not installed: "
-            f"pip install 'hector-jax[{name}]'"
+            f"pip install -e '.[{name}]' in the checkout"
         )
-    with outside_packages(), redirect_stdout(sys.stderr):  # MJX prints which packages are missing
+    with outside_packages(), redirect_stdout(StringIO()):  # MJX lists packages that none needs
         import_module(f"hector_jax.{engine.modules[-1]}")
     return engine

@@ -3,7 +3,7 @@
 No collection, training, tuning, search or choice reads this module; tests/test_architecture.py
 checks that. The plants differ from the hfs in strength and in kind (masses, ground, an estimator
 with noise and drift), so that a map learned on the hfs is not tested on its own simulator. Seeds
-0-31 are for development, 1000-1031 for the final verdict.
+0-31 are for development; published verdicts walked others, which their files name.
 
 There are two families. `standin` draws masses of 0.95 to 1.08 times the nominal ones, so most of
 its plants are heavier; `even` draws them evenly about the nominal ones, and farther from them.

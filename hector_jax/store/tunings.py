@@ -47,7 +47,7 @@ from hector_jax.tuning.evaluate import (
 )
 from hector_jax.tuning.loss import loss_of_robot
 from hector_jax.tuning.rollout import Scenario, rollout, rollout_config
-from hector_jax.tuning.status import StepStatus
+from hector_jax.tuning.status import StepStatus, status_text
 from hector_jax.tuning.variation import drawn_variation
 
 # modules that determine the numbers, for `content_key`
@@ -304,9 +304,17 @@ def mean_norms(setup: Setup, problems: Mapping[str, Problem]) -> dict[str, dict[
 
 
 def relative_matrix(setup: Setup, start: Weights, problem: Problem) -> Float[np.ndarray, "n n"]:
-    """Return the Gauss-Newton matrix divided by the loss, mean over the commands."""
+    """Return the Gauss-Newton matrix divided by the loss, mean over the commands.
+
+    It is empty, for an unknown curvature, if the model cannot walk with these weights.
+    """
     objective = _objective(setup, start, problem)
-    return np.asarray(objective.matrix(start)) / float(objective.evaluate(start).loss)
+    evaluation = objective.evaluate(start)
+    status = StepStatus(int(step_status(setup.config, evaluation)))
+    if why := status_text(status, evaluation):
+        say(f"the curvature of the loss at the start is not known: on the model {why}")
+        return np.zeros((0, 0))
+    return np.asarray(objective.matrix(start)) / float(evaluation.loss)
 
 
 def tune_config(robot: Robot, **settings: Any) -> TuneConfig:

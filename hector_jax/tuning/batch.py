@@ -44,8 +44,8 @@ PER_CALL = 11  # evaluations per problem and call of the device: start and ten
 TICKS_AT_ONCE = 8 * 400  # most on a GPU that are faster at once than in turn
 
 COMPILER_OPTIONS = {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
-"""For `jax.jit` of rollouts: on a GPU, small kernels that do not need each other run side by side
-(docs/performance.md); a CPU ignores it."""
+"""For `jax.jit` of rollouts: on a GPU, small kernels that do not need each other run side by side;
+a CPU ignores it."""
 
 
 class BatchScenario(NamedTuple):
@@ -93,7 +93,7 @@ def choose_rollout(platform: str, config: RolloutConfig, rollouts: int) -> Walk:
     """Choose `rollout` or `parallel_rollout` for the rollouts that one device computes.
 
     A GPU waits in each of a tick's many small steps, so that few rollouts are faster with all their
-    ticks at once (docs/performance.md).
+    ticks at once.
     """
     ticks = rollouts * (config.lead + config.ticks)
     return parallel_rollout if platform == "gpu" and ticks <= TICKS_AT_ONCE else rollout

@@ -31,9 +31,11 @@ LIMIT, WIDTH, FEEDBACK = 0.19, 7 / 8, 2 / 3
 """Numbers of `best` beside its weights: limit of the position error as a share of the height of the
 centre of mass, unless one is given; width and velocity feedback of the steps as shares of the
 controller's. With them fewer walks fall under pushes and on slippery floors."""
-HELD_OUT = 8  # plants that compare the sets of a tuning on walks
 SHARES = (0.0, 0.25, 0.5, 1.0)  # of the accepted iterations: the points of a path that walk
-_FIRST_SEED = 7000  # of plants that a tuning may walk on; those of a choice have the seeds before
+_FIRST_SEED = 7000  # of plants that a tuning may walk on; those of a path have the seeds before
+HELD_OUT = range(8000, 8008)
+"""Seeds of the plants that compare the sets of a tuning on walks: those of a path have chosen the
+start of these walks already, and there it is lucky."""
 
 
 def drawn_plants(robot: Robot, count: int, first_seed: int = _FIRST_SEED) -> list[Imperfections]:
@@ -81,7 +83,7 @@ def walks_best(
     setup: Setup,
     sets: dict[str, Weights],
     commands: Sequence[Command],
-    count: int,
+    plants: int | range,
     **notes: Any,
 ) -> str:
     """Return the name of the set that walks best on drawn plants; the last one without plants.
@@ -92,17 +94,18 @@ def walks_best(
         setup: workers, controller and loss, nominal body.
         sets: sets by name in the order in which they were made, the start first.
         commands: commands to walk, which count alike.
-        count: number of plants.
+        plants: number of plants, which get the seeds of a path, or the seeds themselves.
         notes: of `judging.judge`: `seconds`, `folder` of the scores, which are not walked again,
             `engine`.
     """
     first, last = next(iter(sets)), next(reversed(sets))
-    if not count or first == last:
+    seeds = range(_FIRST_SEED - plants, _FIRST_SEED) if isinstance(plants, int) else plants
+    if not seeds or first == last:
         return last
-    plants = drawn_plants(setup.robot, count, _FIRST_SEED - count)
-    on_plants = f"on {plural(count, 'plant')} drawn around the hfs"
+    drawn = drawn_plants(setup.robot, len(seeds), seeds[0])
+    on_plants = f"on {plural(len(seeds), 'plant')} drawn around the hfs"
     judge = partial(judging.judge, setup, sets, title=f"choosing `best` {on_plants}", **notes)
-    results = [judge(command, plants, range(count)).scores for command in commands]
+    results = [judge(command, drawn, range(len(seeds))).scores for command in commands]
     logs = {
         name: np.mean([np.log(score.L) for scores in results for score in scores[name]])
         for name in sets
