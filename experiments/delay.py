@@ -19,6 +19,7 @@ import plots
 import tyro
 from lib import check_names, write_report
 
+from hector_jax.cli.flags import named_file
 from hector_jax.control.controller import WalkConfig, walk_config
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import nominal
@@ -102,7 +103,7 @@ class Flags:
             count = f"{len(self.delays)} delays and {len(self.lags)} lags"
             raise InputError(f"--lags must be one for each of --delays, got {count}")
         for text in self.robots:
-            if not all(text.partition("=")):
+            if not named_file(text)[0]:
                 raise InputError(f"--robots must be NAME=TOML, got {text!r}")
 
 
@@ -160,7 +161,7 @@ def main() -> None:
     head = ["change", *(f"{delay:g}, {lag:g} ms" for delay, lag in motors)]
     with workers(flags.processes) as pool:
         for text in flags.robots:
-            name, _, file = text.partition("=")
+            name, file = named_file(text)
             robot = load_robot(Path(file))
             loci[name] = {change: root_locus(robot, change) for change in (BEFORE, AS_PROPOSED)}
             picture = f"root-locus-{name}.png"

@@ -18,6 +18,7 @@ import tyro
 from lib import write_report
 
 from hector_jax.cli.arguments import data_folder
+from hector_jax.cli.flags import named_file
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import nominal
 from hector_jax.core.console import exit_code
@@ -50,7 +51,7 @@ class Flags:
     def __post_init__(self) -> None:
         check(self)
         for text in self.robots:
-            if not all(text.partition("=")):
+            if not named_file(text)[0]:
                 raise InputError(f"--robots must be NAME=TOML, got {text!r}")
 
 
@@ -110,7 +111,7 @@ def main() -> None:
     losses = {}
     with workers(flags.processes) as pool:
         for text in flags.robots:
-            name, _, file = text.partition("=")
+            name, file = named_file(text)
             losses[name] = walk_robot(flags, pool, name, None if file == "-" else Path(file))
     head = ["ridge", *(f"{name}: L [%]" for name in losses), "mean log-ratio"]
     table = markdown_table(head, [_row(ridge, losses) for ridge in flags.ridges])

@@ -37,6 +37,7 @@ from scenes import (
     table,
 )
 
+from hector_jax.cli.flags import named_file
 from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import COMMANDS, UNSEEN
 from hector_jax.control.weights import Weights, expert, nominal
@@ -113,9 +114,9 @@ def weight_sets(named: Sequence[str], robot: Robot | None = None) -> dict[str, W
     """
     sets = {BASELINE: nominal(robot), "expert": expert(robot)}
     for text in named:
-        name, _, file = text.partition("=")
+        name, file = named_file(text)
         # names are part of file names, where other characters might make two of them equal
-        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or not file or name in sets:
+        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or name in sets:
             raise InputError(
                 f"--set must be NAME=FILE, a new NAME of letters, digits and _, got {text!r}"
             )

@@ -1,7 +1,7 @@
 """The function of each command of `hector`; its flags are in flags.py."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from functools import partial, singledispatch
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,10 @@ from hector_jax.cli.arguments import print_result
 from hector_jax.control.controller import walk_config
 from hector_jax.control.twin import TwinConfig
 from hector_jax.control.weights import expert, nominal
-from hector_jax.control.weights_file import load_weights, save_weights
+from hector_jax.control.weights_file import save_weights
 from hector_jax.core.console import say
 from hector_jax.core.environment import versions
-from hector_jax.core.files import locked, make_folder, write_file, write_json
+from hector_jax.core.files import locked, write_file, write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
 from hector_jax.core.settings import as_toml, to_table
@@ -68,6 +68,8 @@ def run_collect(args: flags.Collect) -> None:
     config = nets.CollectConfig(args.walks, args.seconds, args.seed, args.engine)
     robot = load_robot(args.robot)
     out = arguments.flag_folder(args, "out", robot)
+    if not args.is_given("out"):
+        out = nets.own_folder(out, config)
     with workers(args.processes, args.cluster) as pool:
         nets.collect_walks(pool, config, robot, out)
     say(f"the walks are in {out}")
@@ -79,8 +81,9 @@ def run_train(args: flags.Train) -> None:
     config = TrainConfig(args.variant, epochs=args.epochs, seed=args.seed)
     robot = load_robot(args.robot)
     data = arguments.flag_folder(args, "data", robot)
-    path = args.out or nets.net_path(data.parent, args.variant)
-    errors = nets.train_net(config, robot, data, path).errors
+    path = args.out or nets.own_path(data, config)
+    with nullcontext() if args.out else locked(path.parent):
+        errors = nets.train_net(config, robot, data, path).errors
     result = {"net": str(path), "errors": errors}
     print_result(args.json, result, partial(arguments.print_errors, errors))
     say(f"the net is in {path}")
@@ -97,33 +100,32 @@ def run_search(args: flags.Search) -> None:
     tuning = arguments.with_length(tunings.tune_config(robot), trajectories[0])
     start = arguments.weights_by_name(args.start, robot)
     out = arguments.flag_folder(args, "out", robot)
-    make_folder(out)
     shared: dict[str, Any] = {"commands": commands, "engine": engine}
-    with workers(args.processes, args.cluster) as pool:
+    with locked(out), workers(args.processes, args.cluster) as pool:
         setup = Setup(pool, tuning, robot)
         results = searches.search_all(setup, config, start, folder=args.record or out, **shared)
         say("walking with the start, expert and best weights")
         sets = {name: [start, expert(robot), result.weights] for name, result in results.items()}
         at_once = config.population * len(commands)
         losses = searches.losses_on_hfs(setup, sets, at_once=at_once, **shared)
-    cards = {}
-    for name, result in results.items():
-        at_start, at_expert, again = losses[name].tolist()
-        cards[name] = {
-            "trajectory": name,
-            "L": {"start": at_start, "best": result.loss, "best_again": again, "expert": at_expert},
-            "walks": len(result.history) * config.population,
-            "best_at": result.walk,
-            "stop": result.stop,
-            "search": to_table(config),
-            "start": args.start,
-            "engine": engine.name,
-            "rollout": to_table(tuning.rollout),
-            "loss": alphas(tuning.loss),
-            "versions": versions(),
-        }
-        save_weights(out / f"{name}.json", result.weights)
-        write_json(out / f"{name}-card.json", cards[name])
+        cards = {}
+        for name, result in results.items():
+            walked = zip(("start", "expert", "best_again"), losses[name].tolist(), strict=True)
+            cards[name] = {
+                "trajectory": name,
+                "L": {"best": result.loss, **dict(walked)},
+                "walks": len(result.history) * config.population,
+                "best_at": result.walk,
+                "stop": result.stop,
+                "search": to_table(config),
+                "start": args.start,
+                "engine": engine.name,
+                "rollout": to_table(tuning.rollout),
+                "loss": alphas(tuning.loss),
+                "versions": versions(),
+            }
+            save_weights(out / f"{name}.json", result.weights)
+            write_json(out / f"{name}-card.json", cards[name])
     print_result(args.json, {"weights": str(out), "cards": cards}, partial(_print_search, cards))
     say(f"the weights are in {out}")
 
@@ -199,16 +201,16 @@ def run_robot(args: flags.Robot) -> None:
 def _write_robot(out: Path, proposal: RobotProposal, comments: Sequence[str], file: Path) -> None:
     """Write a robot in the standard form, or a draft beside a copy of the model that it names."""
     table, name = proposal.table, str(proposal.table["model"])
-    source, model = file.with_name(name), out.with_name(name)
+    source, model = file.parent / name, out.parent / name
     if proposal.wrong:
-        content = source.read_bytes() if source.is_file() and not model.exists() else None
+        content = source.read_bytes() if source.is_file() else None
     else:
         model = out.with_name(f"{out.stem}-standard.xml")
-        if model.exists():
-            raise InputError(f"--out writes {model}, which must be a new file, and it exists")
         table, text = standard_form(proposal, model.name)
         content = text.encode()
-    if content is not None:
+    if model.exists() and (content is None or model.read_bytes() != content):
+        raise InputError(f"--out writes {model}, which must be a new file, and it exists")
+    if content is not None and not model.exists():
         write_file(model, content)
     write_file(out, as_toml(table, comments).encode())
 
@@ -223,8 +225,9 @@ def run_export(args: flags.Export) -> None:
         out = folder / args.template.name.removesuffix(".j2")
         if out.resolve() == args.template.resolve():
             raise InputError(f"--template {out} would be overwritten; name it {out.name}.j2")
-        weights = load_weights(path, load_robot(args.robot))
+        weights = arguments.weights_by_name(str(path), load_robot(args.robot))
         write_file(out, fill_template(args.template, weights).encode())
+        print_result(args.json, {"file": str(out)}, lambda: None)
         say(f"{out} has the weights {path}")
         return
     if is_run and args.robot:
@@ -235,7 +238,7 @@ def run_export(args: flags.Export) -> None:
     text = args.traj or (request.trajectory if request else "straight")
     trajectory = arguments.load_trajectory(text, robot)
     name = f"{args.run.resolve().name}/{path.stem}" if is_run else path.stem
-    weights = load_weights(path, robot)
+    weights = arguments.weights_by_name(str(path), robot)
     say("exporting the controller and comparing it with the live one on a walk")
     with locked(folder):
         card = export.export(

@@ -112,6 +112,7 @@ def run_walk(args: Walk) -> None:
     engine, weights = arguments.engine_of(args), arguments.weights_by_name(args.weights, robot)
     command = arguments.load_trajectory(args.traj, robot)
     loss, config = loss_of_robot(robot.description), walk_config(robot)
+    seconds = arguments.walk_seconds(args, command)
     say("compiling (only the first time on a machine) and walking")
     walk_with = partial(arguments.walk_once, args, robot, command, plant=plant, engine=engine)
     trajectory = walk_with(weights)
@@ -124,7 +125,6 @@ def run_walk(args: Walk) -> None:
     if fell and args.world != "srbm" and not engine.differs:
         fall = fall_of(config, robot, arguments.job_of(args, robot, command, weights, plant))
     if args.out is not None and not args.walker:  # a program's own log is kept as it is
-        seconds = arguments.walk_seconds(args, command)
         about = as_table(args) | {"walk": walk_card(*command[:2], weights, robot, seconds)}
         save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=about)
     where = args.world + ("" if engine is MUJOCO_C else f" in {engine.title}")

@@ -21,7 +21,7 @@ class PathKind(Enum):
     LOG = "a file or NAME=FILE"
     RUN = "the folder of a run of `hector tune`"
     FOLDER = "a folder"  # may not exist yet
-    EXPORTABLE = "a run folder or a weights file"
+    EXPORTABLE = "a run folder, best or a weights file"
     WEIGHTS = "nominal, expert, best or a weights file"
     SETS = "nominal, expert, best, a weights file, or a folder of one for each trajectory"
     TRAJECTORY = "a name or a TOML file"
@@ -134,8 +134,8 @@ class Collect(Configured, ForRobot, Parallel):
     Example: hector collect --walks 128 --out data/more
     """
 
-    out: Folder = Path("data/walks")  # folder for the walks; those already in it are kept
-    walks: Annotated[int, Range(1, 100_000)] = 64  # number of walks
+    out: Folder = Path("data/walks")  # for the walks; its default names settings of your own
+    walks: Annotated[int, Range(3, 100_000)] = 64  # number of walks
     seconds: Annotated[float, Range(0, 600, above=True)] = 4.0  # length of each walk [s]
     seed: Seed = 0  # seed of all random numbers: commands, weights, plants, pushes
     engine: Engine = "auto"  # c: MuJoCo, one walk per process; mjx: all at once; auto: mjx on a GPU
@@ -149,7 +149,7 @@ class Train(Configured, ForRobot, Printed):
     """
 
     data: Folder = Path("data/walks")  # folder of the walks
-    out: Path | None = None  # file for the net; by default grfm.npz or grfm-paper.npz beside DATA
+    out: Path | None = None  # file for the net; by default beside DATA, grfm.npz for a tuning
     variant: Variant = "residual"  # architecture of the net
     epochs: Annotated[int, Range(1, 100_000)] = 200  # passes over the samples
     seed: Seed = 0  # seed of the initial parameters and of the order of the samples
@@ -360,7 +360,7 @@ class Export(Printed):
     Example: hector export latest
     """
 
-    run: Annotated[Path, PathKind.EXPORTABLE]  # run folder, `latest`, or a weights file
+    run: Annotated[Path, PathKind.EXPORTABLE]  # run folder, `latest`, `best` or a weights file
     set: str = "best"  # weight set of the run
     out: Path | None = None  # folder; by default `export` in the run or beside the weights file
     traj: Annotated[str | None, PathKind.TRAJECTORY] = None  # of the check; by default the run's

@@ -9,7 +9,7 @@ import os
 import re
 import shlex
 from collections.abc import Sequence
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from types import NoneType, UnionType
@@ -19,6 +19,7 @@ import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from hector_jax.cli.flags import COMMANDS, NAMED_WEIGHTS, PathKind, named_file, with_given
+from hector_jax.core.console import say
 from hector_jax.core.inputs import InputError, check_file, did_you_mean, one_line, short_repr
 from hector_jax.core.settings import SEED, convert, from_table, read_json, read_toml, to_table
 
@@ -60,7 +61,7 @@ _HEAD = """hector tunes the weights of a walking robot's model predictive contro
 _EXIT_CODES = "Exit codes: 0 done, 1 something is broken, 2 bad input, 130 interrupted."
 _HELP = ("-h", "--help")
 _COMPLETION = "--tyro-print-completion"
-_LATEST = Path("latest")  # stands for the newest run
+_LATEST = Path("latest")  # stands for `latest_run`
 _NUMBERS: dict[Any, str] = {int: "a whole number", float: "a number"}
 
 Flags = TypeVar("Flags")
@@ -211,8 +212,9 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
         if name == "config":
             raise InputError(f"{path}: config stands on the line only")
         values[name] = value
-    if kind in (COMMANDS["tune"], COMMANDS["propose"]) and isinstance(values.get("traj"), str):
-        values["traj"] = [values["traj"]]  # a word for a list of one
+    for field in fields(kind):  # pyright: ignore[reportArgumentType]
+        if isinstance(word := values.get(field.name), str) and get_args(field.type)[1:] == (...,):
+            values[field.name] = [word]  # for a list of one
     # a run records all its flags, also those that nobody gave
     return with_given(from_table(str(path), kind, values), () if path.suffix == ".json" else values)
 
@@ -287,9 +289,7 @@ def _source(kind: Any) -> PathKind | None:
 def _check_source(label: str, value: Path | str, source: PathKind) -> None:
     """Check that a flag names a file or folder of its source that exists; else InputError."""
     text = str(value)
-    if source is PathKind.SETS:
-        text = str(Path(text.rpartition("=")[2]))  # without NAME=
-    if source is PathKind.LOG:
+    if source in (PathKind.SETS, PathKind.LOG):
         _, text = named_file(text)
     path, named, is_dir = Path(text), text in NAMED_WEIGHTS, os.path.isdir(text)
     existing = next(x for x in (path, *path.parents) if os.path.exists(x))
@@ -298,7 +298,7 @@ def _check_source(label: str, value: Path | str, source: PathKind) -> None:
         PathKind.LOG: (True, True),
         PathKind.RUN: (is_dir, False),
         PathKind.FOLDER: (os.path.isdir(existing), False),
-        PathKind.EXPORTABLE: (True, not is_dir),
+        PathKind.EXPORTABLE: (True, not named and not is_dir),
         PathKind.WEIGHTS: (named or path.suffix or os.path.lexists(path), not named),
         PathKind.SETS: (named or is_dir or path.suffix, not named and not is_dir),
         PathKind.TRAJECTORY: (True, path.suffix == ".toml"),
@@ -312,26 +312,47 @@ def _check_source(label: str, value: Path | str, source: PathKind) -> None:
         check_file(path, "the file")
 
 
+def latest_run(resumed: bool = False) -> Path | None:
+    """Return the tuning under `runs/` that began last, by its own record; None without one.
+
+    A run that was refused before its settings were complete counts only if it is to be `resumed`.
+    Of a run and its copies it is the one with the shortest name.
+    """
+    runs: list[tuple[str, int, Path]] = []
+    for folder in (file.parent for file in Path("runs").rglob("versions.json")):
+        with suppress(InputError):  # no run
+            config = read_json(folder / "config.json", "the settings of a run")
+            if not isinstance(config, dict):
+                continue
+            if resumed or "tune" in config or (folder / "walks").is_dir():
+                # older versions recorded it in the name alone
+                named = folder.name if re.fullmatch(r"\d{8}-\d{6}", folder.name) else ""
+                began = str(config.get("began", named))
+                runs.append((began, -len(str(folder)), folder))
+    return max(runs)[2] if runs else None
+
+
 def resolve_latest(flags: Flags) -> Flags:
-    """Replace `latest` in the flags of run folders by the newest run under `runs/`.
+    """Replace `latest` in the flags of run folders by `latest_run`, which is said.
 
     Raises:
         InputError: there is no run.
     """
 
-    def newest(path: Path) -> Path:
+    def newest(path: Path, resumed: bool) -> Path:
         if path != _LATEST or path.exists():
             return path
-        runs = [file for file in Path("runs").rglob("config.json") if file.is_file()]
-        if not runs:
+        if (run := latest_run(resumed)) is None:
             raise InputError("latest: there is no run in the folder `runs` of this directory")
-        return max(runs, key=lambda file: file.stat().st_mtime).parent
+        say(f"latest is {run}")
+        return run
 
     values: dict[str, Any] = {}
     for field in fields(flags):  # pyright: ignore[reportArgumentType]
-        value = getattr(flags, field.name)
+        value, resumed = getattr(flags, field.name), field.name == "resume"
         if value is not None and _source(field.type) in (PathKind.RUN, PathKind.EXPORTABLE):
             is_tuple = isinstance(value, tuple)
-            values[field.name] = tuple(map(newest, value)) if is_tuple else newest(value)
+            found = [newest(path, resumed) for path in (value if is_tuple else (value,))]
+            values[field.name] = tuple(found) if is_tuple else found[0]
     latest = replace(flags, **values)  # pyright: ignore[reportArgumentType]
     return with_given(latest, getattr(flags, "given", ()))

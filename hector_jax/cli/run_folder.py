@@ -23,7 +23,7 @@ from hector_jax.core.settings import convert
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.store.cache import robot_hash
 from hector_jax.store.folder import CONFIG, VERSIONS, flattened, read_object
-from hector_jax.store.nets import COLLECTION_CODE
+from hector_jax.store.nets import COLLECTION_CODE, load_trained
 from hector_jax.walk_tuning.campaign import with_leg_numbers
 
 F = TypeVar("F", bound=Flags)
@@ -53,7 +53,7 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
     Raises:
         InputError: there is no such trajectory, their lengths differ, or --walks is too few for
             them; --walk-engine is not installed; --safe beside a position limit; numbers of the
-            legs without --walks or out of their boxes.
+            legs without --walks or out of their boxes; --net is not its net.
     """
     loaded = arguments.load_trajectories(args.traj, robot, "; add --each")
     count, plants = len(loaded), max(args.walk_plants, 1)
@@ -61,6 +61,8 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
         walks = f"{plural(count, 'command')} on {plural(plants, 'plant')}, twice"
         raise InputError(f"--walks must be 0 or at least {least} ({walks}), got {args.walks}")
     _check_walker(args)
+    if args.net:
+        load_trained(args.net, robot, args.variant)
     arguments.engine_of(args)  # whether it is installed
     start, of_legs = arguments.weights_by_name(args.start, robot), leg_numbers(args.tune)
     if of_legs and not args.walks:
@@ -102,6 +104,7 @@ def begin(folder: Path, args: Tune) -> Path:
         write_json(new / VERSIONS, environment())
         config = {
             "flags": as_table(run_flags(args)),
+            "began": f"{datetime.now():{TIME}}",
             "directory": str(Path.cwd()),
             "robot": robot_hash(load_robot(args.robot)),
             "code": code_hash(*_CODE),

@@ -8,13 +8,13 @@ from typing import NamedTuple, get_args
 
 from hector_jax.cli import arguments
 from hector_jax.cli.arguments import print_result
-from hector_jax.cli.flags import BASELINES, JudgingEngine, Verdict
+from hector_jax.cli.flags import BASELINES, JudgingEngine, Verdict, named_file
 from hector_jax.cli.parse import as_command, as_table
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import Weights
 from hector_jax.core.console import say
 from hector_jax.core.environment import environment
-from hector_jax.core.files import make_folder
+from hector_jax.core.files import locked
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
 from hector_jax.core.settings import SEED
@@ -61,20 +61,20 @@ def run_verdict(args: Verdict) -> None:
     """Walk weight sets in several engines and models, and report which claims hold."""
     plan = plan_of(args)
     say(_plan_text(plan))
-    make_folder(args.out)
     made_with, config = environment(), tunings.tune_config(plan.robot)
-    with workers(args.processes, args.cluster) as pool:
-        setup = Setup(pool, config, plan.robot)
-        cells = walk_cells(setup, plan, args.out / "scores")
-    result = report.write_verdict_report(
-        args.out,
-        cells,
-        family=args.family,
-        differs=plan.differs,
-        config={"flags": as_table(args)},
-        environment=made_with,
-        command=as_command("hector verdict", args),
-    )
+    with locked(args.out):
+        with workers(args.processes, args.cluster) as pool:
+            setup = Setup(pool, config, plan.robot)
+            cells = walk_cells(setup, plan, args.out / "scores")
+        result = report.write_verdict_report(
+            args.out,
+            cells,
+            family=args.family,
+            differs=plan.differs,
+            config={"flags": as_table(args)},
+            environment=made_with,
+            command=as_command("hector verdict", args),
+        )
     path = args.out / "report.md"
     print_text = partial(report.print_verdict, cells, plan.differs, args.family)
     print_result(args.json, {"report": str(path), **result}, print_text)
@@ -146,7 +146,7 @@ def _sets(
     """
     paths: dict[str, Path] = {}
     for text in args.weights:
-        name, _, file = text.rpartition("=")
+        name, file = named_file(text)
         path = Path(file)
         name = name or path.stem
         # names become parts of file names, where other characters might not stay distinct

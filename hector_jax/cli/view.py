@@ -8,6 +8,7 @@ from hector_jax.control.controller import walk_config
 from hector_jax.core.console import say
 from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError, require_package
+from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.network import as_effect, load_net
 from hector_jax.report import fidelity, pictures, view
@@ -42,10 +43,12 @@ def run_view(args: View) -> None:
     data = arguments.data_folder(args.data or request.data, request.robot, robot)
     net = request.net if args.data is None and request.net else nets.net_path(data, request.variant)
     effects = {}
-    if net.exists():
-        effects["residual"] = as_effect(load_net(net, robot, request.variant)[0])
+    params = load_net(net, robot, request.variant)[0] if net.exists() else None
+    if params is not None and (args.data or tree_hash(params) == request.params):
+        effects["residual"] = as_effect(params)
     else:
-        say(f"no net at {net}, so its predictions are not shown; --data names another folder")
+        what = f"no net at {net}" if params is None else f"{net} is not the net of this run"
+        say(f"{what}, so its predictions are not shown; --data names another folder")
 
     def walk() -> tuple[dict[str, view.ViewedWalk], str]:
         """Walk with both sets; return the walks and their description in Markdown."""

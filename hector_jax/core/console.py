@@ -96,6 +96,10 @@ class Broken(RuntimeError):  # noqa: N818, not an error of the program
 _SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 _PATIENCE = 5.0  # [s] for compiled code to return; Python handles no signal meanwhile
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_REFUSALS = (
+    *(errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ESTALE, errno.ENOLCK),
+    *(errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EAGAIN, errno.ENOSYS, errno.ENOTSUP),
+)  # of the machine, whatever the program does
 
 
 class Stopped(KeyboardInterrupt):
@@ -200,10 +204,11 @@ def exit_code(name: str, work: Callable[[], None]) -> int:
     except Broken as error:
         code, text = 1, str(error)
     except OSError as error:
-        if error.errno not in _FULL:
+        if error.errno not in (*_FULL, *_REFUSALS):
             raise
         _drop(sys.stdout)
-        code, text = 1, f"cannot write {error.filename or 'the output'}: {error.strerror}"
+        what = "cannot write" if error.errno in _FULL else "this machine refuses"
+        code, text = 1, f"{what} {error.filename or 'the output'}: {error.strerror}"
     except BrokenExecutor as error:
         if error.__cause__ is not None:  # not a killed process: its exception cannot be unpickled
             raise

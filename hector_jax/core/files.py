@@ -3,9 +3,11 @@
 A file is written under another name and renamed, so readers see the old or the new one in full.
 """
 
+import fcntl
 import json
 import os
 import secrets
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -13,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from filelock import FileLock, Timeout
+from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout
 
 from hector_jax.core.console import Broken, say
 from hector_jax.core.inputs import InputError
@@ -35,22 +37,31 @@ def write_file(path: Path, data: bytes) -> None:
     """Write a file atomically; missing folders are created.
 
     Args:
-        path: the file, replaced if it exists.
+        path: the file, replaced if it exists; it keeps its mode, and a link to it stays. A device
+            or a pipe is written to.
         data: its whole content.
 
     Raises:
         WriteError: one line with the path, if the folder or the disk cannot be written.
     """
-    path = Path(path)
-    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{_PART}")
+    target = Path(os.path.realpath(path))
+    part = target.with_name(f".{target.name}.{secrets.token_hex(4)}{_PART}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        mode = os.stat(path).st_mode if os.path.exists(path) else None
+        if mode is not None and not stat.S_ISREG(mode):
+            Path(path).write_bytes(data)
+            return
+        target.parent.mkdir(parents=True, exist_ok=True)
         with part.open("xb") as file:
+            with suppress(OSError):  # a disk without locks
+                fcntl.flock(file, fcntl.LOCK_EX)  # tells `locked` that its writer lives
             file.write(data)
+            if mode is not None:
+                os.chmod(part, stat.S_IMODE(mode))
             file.flush()
             os.fsync(file.fileno())
-        os.replace(part, path)
-        folder = os.open(path.parent, os.O_RDONLY)
+            os.replace(part, target)
+        folder = os.open(target.parent, os.O_RDONLY)
         try:
             os.fsync(folder)  # make the rename durable as well
         finally:
@@ -87,18 +98,32 @@ def locked(folder: Path) -> Iterator[None]:
         InputError: one line with the folder that cannot be created or written.
     """
     make_folder(folder)
-    lock = FileLock(Path(folder).resolve() / ".lock", is_singleton=True)
-    try:
-        lock.acquire(blocking=False)
-    except Timeout:
-        say(f"{folder}: another process is writing there; waiting for it to end")
-        lock.acquire()
+    lock = _lock(Path(folder))
     try:
         for part in Path(folder).glob(f".*{_PART}"):
-            part.unlink(missing_ok=True)
+            with suppress(OSError), part.open("r+b") as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # fails while its writer lives
+                part.unlink()
         yield
     finally:
         lock.release()
+
+
+def _lock(folder: Path) -> BaseFileLock:
+    """Lock a folder: by the system, or by a file that exists on a disk that has no locks."""
+    reason = None
+    for kind, name in ((FileLock, ".lock"), (SoftFileLock, ".lock-file")):
+        lock = kind(folder.resolve() / name, is_singleton=True)
+        try:
+            lock.acquire(blocking=False)
+        except Timeout:
+            say(f"{folder}: another process is writing there; waiting for it to end")
+            lock.acquire()
+        except OSError as error:
+            reason = error.strerror
+            continue
+        return lock
+    raise InputError(f"cannot lock {folder}: {reason}; name a folder on another disk")
 
 
 def as_json(value: Any, indent: int | None = None) -> str:

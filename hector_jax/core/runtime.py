@@ -4,6 +4,7 @@ The library itself leaves `jax.config` alone; programs (cli, experiments, benchm
 processes) call `setup_jax` once, before the first array.
 """
 
+import errno
 import gc
 import os
 import signal
@@ -31,10 +32,12 @@ def cache_folder() -> Path:
     Raises:
         InputError: it cannot be written, or its name is not UTF-8.
     """
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    base = os.path.expanduser(os.environ.get("XDG_CACHE_HOME") or "~/.cache")
     folder = Path(base) / "hector_jax" / "jax"
     check_utf8("XDG_CACHE_HOME or the folder of the cache", str(folder))  # JAX takes no other name
     try:
+        if base[0] == "~":
+            raise FileNotFoundError(errno.ENOENT, "this user has no home")
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:

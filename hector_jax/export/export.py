@@ -6,6 +6,7 @@ compiler, nothing is written unless the compiled controller returns the same out
 
 import hashlib
 import io
+import os
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -108,11 +109,14 @@ def _require_same(result: Check) -> None:
 def _checked(
     config: WalkConfig, robot: Robot, source: dict[str, str], recorded: WalkRecord
 ) -> dict[str, Any] | None:
-    """Compile the source, compare it with the live controller; None without a compiler."""
+    """Compile the source, compare it with the live controller; None where it cannot run."""
     if compiler() is None:
         say("there is no C compiler (cc): the check of controller.c did not run")
         return None
     with tempfile.TemporaryDirectory() as folder:
+        if os.statvfs(folder).f_flag & os.ST_NOEXEC:
+            say(f"no program runs in {folder} (TMPDIR): the check of controller.c did not run")
+            return None
         library = compile_controller(source, Path(folder))
         result = compare_with_live(config, robot, library, recorded)
     _require_same(result)
@@ -139,7 +143,7 @@ def export(
 
     Returns:
         The card, also in `controller.json`: sha256 of the files, weights, settings and the check,
-        which is None if there is no C compiler.
+        which is None if there is no C compiler or the compiled program cannot run.
 
     Raises:
         InputError: see `record` and `controller_source`; or the folder cannot be written.

@@ -87,12 +87,10 @@ def collect(
                 report_progress(done, len(missing), "")
 
     with locked(folder):
-        if (path := Path(folder) / _CARD).exists():
-            check_settings(path, _read_card(folder)["settings"], card["settings"])
-        elif any(Path(folder).glob("walk-*.npz")):
-            raise InputError(f"{folder}: has walks but no {_CARD} that says of what; remove it")
-        else:
-            write_json(path, card)
+        if not check_made(folder, card["settings"]):
+            if any(Path(folder).glob("walk-*.npz")):
+                raise InputError(f"{folder}: has walks but no {_CARD} that says of what; remove it")
+            write_json(Path(folder) / _CARD, card)
         like = walks_like(robot)
         paths = dict(enumerate(_paths(folder, len(jobs))))
         load_or_make(paths, make, like=lambda _: like, kind="walks", robot=robot, about=_FACTS)
@@ -100,6 +98,19 @@ def collect(
 
 def _paths(folder: Path, walks: int) -> list[Path]:
     return [Path(folder) / f"walk-{i:05d}.npz" for i in range(walks)]
+
+
+def check_made(folder: Path, settings: Mapping[str, Any]) -> bool:
+    """Check that a folder's walks, if there are any, have these settings; return if it has a card.
+
+    Raises:
+        InputError: one line with the first that differs, or the card is damaged.
+    """
+    if not (Path(folder) / _CARD).exists():
+        return False
+    made = _read_card(folder)["settings"]
+    check_settings(folder, {name: made.get(name) for name in settings}, settings)
+    return True
 
 
 def is_finished(folder: Path) -> bool:

@@ -61,6 +61,7 @@ class RunRequest(NamedTuple):
     variant: str  # of the net
     robot: Path | None  # TOML of the robot; None: HECTOR
     body: str  # `robot_hash` of the robot at the start
+    params: str | None  # `tree_hash` of the parameters of the net; None: not loaded yet
 
 
 def load_run(folder: Path) -> Run:
@@ -72,6 +73,7 @@ def load_run(folder: Path) -> Run:
     result, config, made_with = (read_object(folder / name) for name in (RESULT, CONFIG, VERSIONS))
     if not isinstance(result.get("sets"), dict):
         raise InputError(f"{folder / RESULT}: no `sets` in it; expected the result of a tuning")
+    config.pop("began", None)  # no setting
     return Run(str(folder), result, read_histories(folder), flattened(config), made_with)
 
 
@@ -96,6 +98,7 @@ def read_request(folder: Path) -> RunRequest:
             variant=str(flags["variant"]),
             robot=flags["robot"] and Path(flags["robot"]),
             body=config["robot"],
+            params=config.get("net"),
         )
     except (LookupError, TypeError, AttributeError, ValueError) as error:
         raise InputError(

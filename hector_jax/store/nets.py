@@ -1,7 +1,7 @@
 """The steps `collect` and `fit`: collection of walks, and training of nets on them."""
 
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +33,7 @@ from hector_jax.store.cache import content_key, robot_hash
 from hector_jax.store.setup import Setup
 from hector_jax.store.tunings import TUNING_CODE, compile_programs, tune_config, tuning_paths
 
+_WALKS = "walks"  # folder of the walks of a tuning, beside its net
 # modules that determine the numbers, for `code_hash`
 TRAINING_CODE = ("store.nets", "grfm.training")
 COLLECTION_CODE = (*TUNING_CODE, "store.collection", "grfm.jobs", "sim.walk", "sim.parallel")
@@ -94,6 +95,8 @@ def collect_walks(pool: Executor, config: CollectConfig, robot: Robot, folder: P
     engine = choose_engine(config.engine)
     what = f"{plural(config.walks, 'walk')} on the high-fidelity simulator, engine {engine.name}"
     with locked(folder):
+        settings = collection_settings(config, robot)
+        collection.check_made(folder, settings)
         setup = Setup(pool, tune_config(robot), robot)
         compile_programs(setup, nominal(robot), command_of("straight"))
         paths = tuning_paths(pool, robot, folder / "paths")
@@ -103,7 +106,7 @@ def collect_walks(pool: Executor, config: CollectConfig, robot: Robot, folder: P
             jobs,
             lambda missing: engine.walk(pool, walk_config(robot), robot, missing, exact=False),
             robot=robot,
-            settings=collection_settings(config, robot),
+            settings=settings,
             title=f"collecting {what}",
         )
 
@@ -177,6 +180,27 @@ def net_path(data: Path, variant: str) -> Path:
     return data / ("grfm.npz" if variant == TrainConfig.variant else f"grfm-{variant}.npz")
 
 
+def own_path(walks: Path, config: TrainConfig) -> Path:
+    """Return the file of a net: `net_path`, with what a tuning would not train it with or on."""
+    path = net_path(walks.parent, config.variant)
+    if walks.name != _WALKS:
+        path = path.with_stem(f"{path.stem}-{walks.name}")
+    return _apart(path, config, TrainConfig(variant=config.variant))
+
+
+def own_folder(walks: Path, config: CollectConfig) -> Path:
+    """Return the folder of walks, with the settings in its name that a tuning would not have."""
+    if choose_engine(config.engine) == choose_engine(CollectConfig.engine):
+        config = replace(config, engine=CollectConfig.engine)
+    return _apart(walks, config, CollectConfig())
+
+
+def _apart(path: Path, config: Any, default: Any) -> Path:
+    usual = asdict(default)
+    other = [f"-{name}-{value}" for name, value in asdict(config).items() if value != usual[name]]
+    return path.with_name("".join([path.stem, *other, path.suffix]))
+
+
 def load_trained(path: Path, robot: Robot, variant: str) -> tuple[TrainedNet, dict[str, Any]]:
     """Load a net from a file, with the description of its training from its card.
 
@@ -228,12 +252,11 @@ def load_or_train(
             net on other walks, or a file is damaged or of another robot or variant.
     """
     config = TrainConfig(variant=variant)
-    walks, path = data / "walks", net_path(data, config.variant)
-    settings = collection_settings(CollectConfig(), robot)
+    walks, path = data / _WALKS, net_path(data, config.variant)
+    collection.check_made(walks, collection_settings(CollectConfig(), robot))
     if not collection.is_finished(walks):
         collect_walks(pool, CollectConfig(), robot, walks)
     made_of = collection.fingerprint(walks)
-    check_settings(walks, {name: made_of.get(name) for name in settings}, settings)
     with locked(data):  # a second process waits here, and then loads the net
         if not path.exists():
             return train_net(config, robot, walks, path)
