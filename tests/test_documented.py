@@ -47,10 +47,12 @@ def words_of(line):
     for flag in {"--seeds", "--walks", "--budget", "--population", "--engine"} & {*small, *words}:
         if flag in small and flag in words:
             del words[words.index(flag) : words.index(flag) + 2]
-    if command == "tune" and "--walker" in words:
+    if command == "tune" and "--walker" in words:  # or as the run that is resumed
         small = ["--seeds", "1"]
+    if "--resume" in words:
+        small = []
     if command == "tune" and "--walks" in words:
-        words[words.index("--walks") + 1] = "12" if "c" in words else "4"
+        words[words.index("--walks") + 1] = "12" if "c" in words else "8"
     if command in ("tune", "search") and not {"--traj", "--resume", "--config"} & {*words}:
         words += ["--traj", "straight"]
     files = command not in SECONDS or "runs/robot" in line  # that `hector propose` was given
@@ -63,7 +65,7 @@ def words_of(line):
 def found(word, files):
     """The words that stand for one: short trajectories, files that there are, the last run."""
     name = Path(word).stem
-    if name == "slalom" or (files and word in SPEEDS):
+    if word == "examples/slalom.toml" or (files and word in SPEEDS):
         return [f"short/{name}.toml"]
     if "TIME" in word:
         return [word.replace("runs/c/TIME", str(max(Path("runs/short-c").iterdir())))]
@@ -88,11 +90,13 @@ PAIRS = [
     "hector tune --resume runs/smooth",
     "hector tune --traj straight --walks 4 --alpha auto --tune all --out runs/auto",
     "hector tune --traj straight --walks 4 --tune legs --walk-plants 0 --out runs/legs",
-    "hector tune --robot examples/quadruped/robot.toml --walks 4 --variant paper --out runs/four",
+    "hector tune --robot examples/quadruped/robot.toml --walks 4 --out runs/four",
     "hector view runs/four",
     "hector export runs/four",
+    "hector tune --traj straight --variant paper --out runs/paper",
+    "hector export runs/paper",
     "hector tune --traj straight c --each --walks 4 --safe 0.05 --out runs/each",
-    "hector tune --resume runs/each/c",
+    "hector tune --resume runs/each/short-c",
     "hector tune --traj straight --start best --alpha auto --verdict --json --out runs/judged",
     "hector tune --traj straight --net data/more.npz --out runs/net",
     "hector view runs/net",
@@ -139,7 +143,7 @@ def console(tmp_path_factory):
         patch.chdir(tmp_path_factory.mktemp("reader"))
         patch.setattr(nets, "CollectConfig", lambda: small)
         patch.setattr(nets, "TrainConfig", TwoEpochs)
-        patch.setattr(nets, "tuning_paths", lambda *_: [])
+        patch.setattr(nets, "tuning_paths", lambda *_, **__: [])
         for module in (commands, evaluate, propose, tune, verdict, walker):
             patch.setattr(module, "workers", lambda *_: nullcontext(pool))
         for folder in ("assets", "examples"):
@@ -147,10 +151,10 @@ def console(tmp_path_factory):
         Path("short").mkdir()
         for name, speed in SPEEDS.items():
             Path(f"short/{name}.toml").write_text(SHORT.format(f"short-{name}", speed))
-        for name in ("controller.py", "hector.xml", "twin.toml"):
-            shutil.copy(own / name, name)
-        shutil.copy(own / "walker.py", "mine.py")
-        shutil.copy(own / "twin.toml", "mine.toml")
+        Path("mine.py").symlink_to(own / "walker.py")
+        Path("hector.xml").symlink_to(own / "hector.xml")
+        for name in ("mine", "twin"):
+            Path(f"{name}.toml").symlink_to(own / "twin.toml")
         shutil.copy(four / "quadruped.xml", "h1.xml")
         for name in ("mine", "best", *(f"runs/tuned/{name}" for name in SPEEDS)):
             save_weights(Path(f"{name}.json"), expert())

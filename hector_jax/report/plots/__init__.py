@@ -222,7 +222,8 @@ def save_wrenches(
             period, (T, feet, 3) each; constant over the period.
         seconds: length from the start of the walk [s]; two steps by default.
     """
-    count = round(seconds / period)
+    first = next(iter(curves.values())).force
+    count = min(round(seconds / period), len(first))
     labels = ["$F_x$ [N]", "$F_y$ [N]", "$F_z$ [N]", "$M_x$ [N m]", "$M_y$ [N m]", "$M_z$ [N m]"]
     order = ("measured", "commanded", "linear", "paper", "predicted")
     # point feet have no moments
@@ -239,8 +240,7 @@ def save_wrenches(
             panel.set_ylabel(label)
             style.widen(panel, 5.0 if "[N]" in label else 0.5)
         setp(panels[-1], xlabel="time [s]")
-    feet = next(iter(curves.values())).force.shape[1]
-    return caption("wrenches", side=FEET[feet][0].replace("_", " "))
+    return caption("wrenches", side=FEET[first.shape[1]][0].replace("_", " "))
 
 
 def save_open_loop(path: Path, worlds: Mapping[str, Mapping[str, Drift]]) -> str:
