@@ -186,8 +186,7 @@ class Tune(Configured, ByWalker, Parallel):
     alpha: Literal["paper", "auto"] = "paper"  # loss weights; auto makes the gradient norms alike
     # price in `best` of changes of the command between switches of stance: more, smoother commands
     smooth: Annotated[float, Range(0, 1000)] = 3.0
-    # limit [m] of the position error in the MPC of `best`; by default 0.19 of the height of its
-    # centre of mass
+    # limit [m] of the position error of `best`; by default 0.19 of the height of the centre of mass
     safe: Annotated[float | None, Range(0.001, 10)] = None
     data: Folder = Path("data")  # folder of the walks and the net, which are made if missing
     net: Annotated[Path | None, PathKind.FILE] = None  # another net, instead of that in DATA

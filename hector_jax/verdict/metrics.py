@@ -186,9 +186,8 @@ def interval_of_mean(values: Float[np.ndarray, " plants"]) -> Interval:
     if count < FEWEST:
         return Interval(value, np.nan, np.nan)
     error = np.std(values, ddof=1) / (np.sqrt(count) * max(abs(value), _TINY))
-    width = np.exp(stdtrit(count - 1, (1 + COVERAGE) / 2) * error)
-    low, high = sorted((value / width, value * width))
-    return Interval(value, float(low), float(high))
+    width = float(np.exp(stdtrit(count - 1, (1 + COVERAGE) / 2) * error))
+    return Interval(value, *sorted((value / width, value * width)))
 
 
 def mean(verdict: Verdict, name: str, part: str = "L") -> Interval:
