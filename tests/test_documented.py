@@ -141,7 +141,8 @@ def console(tmp_path_factory):
     own, four = ROOT / "examples" / "own_controller", ROOT / "examples" / "quadruped"
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("reader"))
-        patch.setattr(nets, "CollectConfig", lambda: small)
+        asked = nets.CollectConfig  # with numbers, by `hector collect`
+        patch.setattr(nets, "CollectConfig", lambda *given: asked(*given) if given else small)
         patch.setattr(nets, "TrainConfig", TwoEpochs)
         patch.setattr(nets, "tuning_paths", lambda *_, **__: [])
         for module in (commands, evaluate, propose, tune, verdict, walker):
