@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from model import BEST_OTHERS
+from model import BEST_OTHERS, small_net
 from pretend import call, instead, refused
 from synthetic import synthetic_walk
 
@@ -18,10 +18,13 @@ from hector_jax.cli.parse import from_file
 from hector_jax.control.parameters import GROUPS
 from hector_jax.control.weights import weight_names, weights_to_vector
 from hector_jax.control.weights_file import load_weights
+from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError
+from hector_jax.grfm.network import save_net
 from hector_jax.robot.description import MODEL_PATH
+from hector_jax.robot.model import load_robot
 from hector_jax.store import nets, tunings
-from hector_jax.store.nets import CollectConfig
+from hector_jax.store.nets import CollectConfig, TrainedNet
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
 
@@ -70,7 +73,7 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
         ("walk --weights exprt", "'exprt'; did you mean 'expert'?"),
         ("tune --traj circle", "straight, c, s"),
         ("collect --seconds 0.001", "at least 0.03 s, the 3 ticks of one sample, got 0.001"),
-        ("collect --walks 2", "at least 3"),
+        ("collect --walks 2", "--walks must be a whole number from 3 to"),
         ("search --budget 9", "budget"),
     ],
 )
@@ -91,6 +94,48 @@ def test_a_robot_without_a_best_set_says_so(monkeypatch, capsys, tmp_path):
     ):
         assert told in refused(monkeypatch, capsys, *words, "--robot", robot)
     assert not (tmp_path / "run").exists()
+
+
+def test_the_set_that_comes_along_fills_a_template_and_the_file_is_told(
+    monkeypatch, capsys, tmp_path
+):
+    monkeypatch.chdir(tmp_path)
+    Path("gains.yaml.j2").write_text("{{ Q.euler[0] }}")
+    words = ("--template", "gains.yaml.j2", "--out", "out", "--json")
+    assert call(monkeypatch, "export", "best", *words) == 0
+    assert json.loads(capsys.readouterr().out) == {"file": "out/gains.yaml"}
+    assert float(Path("out/gains.yaml").read_text()) > 0.0
+
+
+def test_a_net_of_another_variant_is_refused_before_there_is_a_run(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    save_net(Path("net.npz"), small_net(), robot=load_robot(), about={})
+    line = refused(monkeypatch, capsys, "tune", "--net", "net.npz", "--variant", "paper")
+    assert "net.npz: holds grfm-residual, expected grfm-paper" in line
+    assert not Path("runs").exists()
+
+
+def test_a_step_with_settings_of_its_own_leaves_what_a_tuning_reads(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    trained = TrainedNet(small_net(), None, {}, None, None, [])
+    paths = []
+    instead(monkeypatch, nets, "train_net", lambda *args: paths.append(args[-1]) or trained)
+    instead(monkeypatch, nets, "collect_walks", lambda *args: paths.append(args[-1]))
+    for line in ("", "--epochs 5", "--data data/more", "--variant paper --seed 2", "--out a.npz"):
+        assert call(monkeypatch, "train", *line.split(), "--json") == 0
+    found = "data/grfm data/grfm-epochs-5 data/grfm-more data/grfm-paper-seed-2 a".split()
+    assert paths == [Path(f"{name}.npz") for name in found]
+    paths.clear()
+    for line in ("", "--engine c", "--walks 128", "--walks 128 --out data/walks"):
+        assert call(monkeypatch, "collect", *line.split()) == 0
+    assert list(map(str, paths)) == ["data/walks"] * 2 + ["data/walks-walks-128", "data/walks"]
+
+
+def test_walks_of_other_settings_are_refused_before_anything_is_compiled(monkeypatch, tmp_path):
+    monkeypatch.setattr(nets, "compile_programs", None)
+    write_json(tmp_path / "card.json", {"walks": 4, "settings": {"walks": 4}})
+    with pytest.raises(InputError, match=f"^{tmp_path}: made"):
+        nets.collect_walks(None, nets.CollectConfig(walks=5), load_robot(), tmp_path)
 
 
 def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):

@@ -169,7 +169,7 @@ def test_a_collection_of_something_else_is_not_overwritten(tmp_path):
         (0, 5, "made with ticks 4, this command expects 5"),
     ):
         jobs, settings = draw_jobs(seed, 2), {"ticks": ticks}
-        with pytest.raises(ValueError, match=f"card.json: {fault}"):
+        with pytest.raises(ValueError, match=f": {fault}"):
             collect(tmp_path, jobs, walker([]), robot=ROBOT, settings=settings)
     assert (tmp_path / "walk-00000.npz").read_bytes() == before
     with pytest.raises(ValueError, match="walk-00000.npz: made for robot"):

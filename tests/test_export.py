@@ -4,6 +4,7 @@ import contextlib
 import ctypes
 import io
 import json
+import os
 import re
 import runpy
 import shutil
@@ -12,6 +13,7 @@ import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -605,6 +607,14 @@ def test_without_a_compiler_the_files_are_written_and_a_line_says_so(monkeypatch
         monkeypatch.setattr(module, "compiler", lambda: None)
     assert call(monkeypatch, run, "--seconds", "0.1") == 0
     assert "no C compiler (cc): the check of controller.c did not run" in capsys.readouterr().err
+    assert json.loads((run / "export" / "controller.json").read_text())["check"] is None
+
+
+def test_where_no_program_may_run_the_files_are_written_all_the_same(monkeypatch, capsys, run):
+    """As in a temporary folder that is mounted so."""
+    monkeypatch.setattr(os, "statvfs", lambda folder: SimpleNamespace(f_flag=os.ST_NOEXEC))
+    assert call(monkeypatch, run, "--seconds", "0.1") == 0
+    assert "(TMPDIR): the check of controller.c did not run" in capsys.readouterr().err
     assert json.loads((run / "export" / "controller.json").read_text())["check"] is None
 
 

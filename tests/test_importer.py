@@ -327,6 +327,13 @@ def test_soles_of_meshes_are_asked_for(monkeypatch, capsys, tmp_path):
     assert err.endswith(f"hector: {line}\n")
     assert f"# To be mended: {line}" in draft.read_text()
     assert read_description(draft).model == path
+    # beside another robot's model of this name, the draft would mean that one
+    other = tmp_path / "other" / path.name
+    other.parent.mkdir()
+    other.write_text("<mujoco/>")
+    assert call(monkeypatch, "robot", path, "--out", other.with_name("draft.toml")) == 2
+    assert f"{other}, which must be a new file" in capsys.readouterr().err
+    assert [file.name for file in other.parent.iterdir()] == [other.name]
     # whoever leaves the contacts as they are takes them
     assert call(monkeypatch, "robot", draft, "--out", out) == 0
     assert f"walk with it: hector walk --robot {out}" in capsys.readouterr().err
@@ -404,6 +411,7 @@ def test_a_proposal_is_written_once_and_beside_its_model(monkeypatch, capsys, tm
         assert call(monkeypatch, "robot", model, "--out", wrong) == 2
         assert text in capsys.readouterr().err
     out.unlink()
+    out.with_name("robot-standard.xml").write_text("of another robot")
     assert call(monkeypatch, "robot", model, "--out", out) == 2
     assert "robot-standard.xml, which must be a new file" in capsys.readouterr().err
 

@@ -11,8 +11,9 @@ import pytest
 from pretend import refused
 
 from hector_jax.cli import commands
-from hector_jax.cli.flags import COMMANDS, Compare, Evaluate, Export, Tune, View, Walk
-from hector_jax.cli.parse import from_line, resolve_latest
+from hector_jax.cli.flags import COMMANDS, Compare, Evaluate, Export, Tune, View, Walk, named_file
+from hector_jax.cli.parse import check_flags, from_line, resolve_latest
+from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError
 
 
@@ -113,19 +114,28 @@ def test_a_folder_that_cannot_be_one_is_told_before_anything_is_made(
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_latest_is_the_newest_run(monkeypatch, tmp_path):
+def test_latest_is_the_tuning_that_began_last(monkeypatch, capsys, tmp_path):
+    """Not a copy, a folder of `hector propose` or of a verdict, nor a run that was refused."""
     monkeypatch.chdir(tmp_path)
-    for age, name in ((9, "c/1"), (5, "strider/s/2"), (7, "s/3")):
-        run = tmp_path / "runs" / name
-        run.mkdir(parents=True)
-        (run / "config.json").touch()
-        os.utime(run / "config.json", (1e9 - age, 1e9 - age))
+    for name, config in (
+        ("strider/s/2", {"tune": {}, "began": "20260203-000000"}),
+        ("c/1", {"tune": {}, "began": "20260101-000000"}),
+        ("s/20260202-000000", {"tune": {}}),  # of a version that did not record it
+        ("s/20260202-000000.bak", {"tune": {}}),
+        ("strider/s/2.copy", {"tune": {}, "began": "20260203-000000"}),
+        ("refused", {"began": "20260301-000000"}),
+        ("list", []),
+    ):
+        write_json(tmp_path / "runs" / name / "config.json", config)
+        write_json(tmp_path / "runs" / name / "versions.json", {})
+    write_json(tmp_path / "runs" / "robot" / "config.json", {"flags": {}})
     for words in (["view", "latest"], ["export", "latest"]):
         assert resolve_latest(from_line(words)).run == Path("runs/strider/s/2")
     found = resolve_latest(from_line(["compare", "runs/c/1", "latest"]))
     assert found.runs == (Path("runs/c/1"), Path("runs/strider/s/2"))
+    assert "latest is runs/strider/s/2\n" in capsys.readouterr().err
     found = resolve_latest(from_line(["tune", "--resume", "latest"]))
-    assert found == Tune(resume=Path("runs/strider/s/2"))
+    assert found == Tune(resume=Path("runs/refused"))  # perhaps it was cut
     (tmp_path / "latest").mkdir()  # one that is there under that name is meant
     assert resolve_latest(from_line(["view", "latest"])).run == Path("latest")
 
@@ -139,12 +149,28 @@ STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
     [
         (f"walk --traj {SLALOM} --seconds 4", "slalom lasts 6 s, as its file says, got 4"),
         ("evaluate --world ideal --seeds 8", "--seeds 8: --world ideal is one plant"),
+        (f"walk --traj {SLALOM} --seconds 2 --out never.npz", "got 2"),
         ("evaluate --world hfs --first-seed 3", "--first-seed 3: --world hfs is one plant"),
     ],
 )
 def test_what_is_given_beside_what_already_fixes_it_is_refused(line, fault):
     with pytest.raises(InputError, match=fault):
         commands.run(from_line(line.split()))
+
+
+@pytest.mark.parametrize("name", ["evaluate", "verdict"])
+def test_a_word_in_a_file_is_a_list_of_one(tmp_path, name):
+    (tmp_path / "flags.toml").write_text('weights = "nominal"\n')
+    flags = from_line([name, "--config", str(tmp_path / "flags.toml")])
+    assert flags.weights == ("nominal",)
+
+
+def test_a_path_with_an_equals_sign_is_a_file_where_there_is_one(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    write_json(Path("a=b/mine.json"), {})
+    assert named_file("a=b/mine.json") == ("", "a=b/mine.json")
+    assert named_file("c=b/mine.json") == ("c", "b/mine.json")
+    check_flags(from_line(["verdict", "--weights", "nominal", "a=b/mine.json"]))
 
 
 # Names that are not text

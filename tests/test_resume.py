@@ -1,6 +1,7 @@
 """Cut anywhere, taken up again: the same bytes; and who may write, and how a program is stopped."""
 
 import errno
+import fcntl
 import json
 import os
 import re
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +25,7 @@ from hector_jax.core import files as core_files
 from hector_jax.core.console import exit_code
 from hector_jax.core.files import WriteError, locked, write_json
 from hector_jax.core.inputs import InputError
-from hector_jax.core.runtime import workers
+from hector_jax.core.runtime import cache_folder, workers
 from hector_jax.core.tree_file import save_tree
 from hector_jax.robot.model import load_robot
 from hector_jax.store.cache import load_or_make
@@ -110,6 +112,72 @@ def test_a_disk_that_refuses_is_one_line_and_loses_nothing(tmp_path, monkeypatch
 def test_a_folder_that_cannot_be_written_is_told_before_anything_is_computed():
     with pytest.raises(InputError, match="cannot write to /proc"), locked(Path("/proc")):
         pass
+
+
+def test_a_link_a_mode_and_a_device_stay(tmp_path):
+    """An atomic write renames a file, which would put a plain file into the place of these."""
+    file, link, null = tmp_path / "file.json", tmp_path / "link.json", tmp_path / "null"
+    file.write_text("old")
+    file.chmod(0o640)
+    link.symlink_to(file.name)
+    null.symlink_to(os.devnull)
+    for path in (link, null):
+        write_json(path, "new")
+        assert path.is_symlink()
+    assert (file.read_text(), file.stat().st_mode & 0o777) == ('"new"\n', 0o640)
+    assert Path(os.devnull).is_char_device()
+    assert {path.name for path in tmp_path.iterdir()} == {"file.json", "link.json", "null"}
+
+
+def test_a_pipe_is_written_to(tmp_path):
+    os.mkfifo(pipe := tmp_path / "pipe")
+    reader = ThreadPoolExecutor(1).submit(pipe.read_text)
+    write_json(pipe, 3)
+    assert reader.result(10) == "3\n"
+    assert pipe.is_fifo()
+
+
+def test_a_lock_leaves_the_file_that_another_is_writing(tmp_path, monkeypatch):
+    def fsync(handle):
+        with locked(tmp_path):
+            pass
+
+    monkeypatch.setattr(core_files, "os", SimpleNamespace(**{**vars(os), "fsync": fsync}))
+    write_json(tmp_path / "state.json", 3)
+    assert (tmp_path / "state.json").read_text() == "3\n"
+
+
+def test_a_disk_without_locks_is_locked_by_a_file(tmp_path, monkeypatch):
+    def no_lock(handle, how):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", no_lock)
+    for _ in range(2):
+        with locked(tmp_path), locked(tmp_path):
+            write_json(tmp_path / "state.json", 3)
+            assert (tmp_path / ".lock-file").exists()
+        assert not (tmp_path / ".lock-file").exists()
+    monkeypatch.setattr(core_files, "SoftFileLock", core_files.FileLock)
+    with pytest.raises(InputError, match="cannot lock .*: No locks available; name a folder on"):
+        locked(tmp_path).__enter__()
+
+
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.EROFS, errno.EMFILE])
+def test_what_the_machine_refuses_is_one_line(capsys, code):
+    def work():
+        raise OSError(code, os.strerror(code), "there")
+
+    assert exit_code("toy", work) == 1
+    assert capsys.readouterr().err == f"toy: this machine refuses there: {os.strerror(code)}\n"
+
+
+def test_a_user_without_a_home_gets_a_line_and_no_folder_of_that_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)
+    with pytest.raises(InputError, match="this user has no home; set XDG_CACHE_HOME"):
+        cache_folder()
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_second_writer_waits_for_the_first_and_says_so(tmp_path, capsys):

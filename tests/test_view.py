@@ -1,5 +1,6 @@
 """A run on a page: what is drawn is what was walked, and a growing run is seen to grow."""
 
+import json
 import signal
 import subprocess
 import sys
@@ -8,6 +9,7 @@ import time
 import numpy as np
 import pytest
 from browser import CHROMIUM, opened
+from model import small_net
 from pretend import call, elsewhere, instead, pretend_history, pretend_walk, refused
 
 from hector_jax.cli import arguments
@@ -18,7 +20,9 @@ from hector_jax.control.weights_file import save_weights
 from hector_jax.core import inputs
 from hector_jax.core.files import write_json
 from hector_jax.core.journal import write_rows
-from hector_jax.report import pictures, view
+from hector_jax.core.tree_file import tree_hash
+from hector_jax.grfm.network import save_net
+from hector_jax.report import fidelity, pictures, view
 from hector_jax.report.motion import motion
 from hector_jax.report.view import ViewedWalk, arrows
 from hector_jax.robot.model import load_robot
@@ -169,6 +173,22 @@ def test_no_client_of_the_page_opens_a_tunnel(page, monkeypatch):
     monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *_: opened.append(1))
     assert page[0].request_share_url() is None  # what a client's message calls
     assert not opened
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_only_the_net_of_the_run_predicts(monkeypatch, capsys, tmp_path, own):
+    drawn, net = [], small_net()
+    instead(monkeypatch, arguments, "walk_once", lambda *_: pretend_walk(seconds=0.3))
+    instead(monkeypatch, fidelity, "curves", lambda *args: drawn.append(args[2]) or {})
+    instead(monkeypatch, pictures, "of_view", lambda *args: None)
+    run = pretend_run(tmp_path / "run")
+    save_net(run / "data" / "grfm.npz", net, robot=load_robot(), about={})
+    path = run / "config.json"
+    write_json(path, json.loads(path.read_text()) | {"net": tree_hash(net) if own else "another"})
+    words = ["--world", "srbm", "--sets", "nominal", "expert", "--headless"]
+    assert call(monkeypatch, "view", run, *words) == 0
+    assert [list(effects) for effects in drawn] == [["residual"] if own else []] * 2
+    assert ("grfm.npz is not the net of this run" in capsys.readouterr().err) != own
 
 
 def until(seconds, seen):

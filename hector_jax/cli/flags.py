@@ -1,5 +1,6 @@
 """The flags of each command; a field's comment is its help text, its type contains its range."""
 
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from enum import Enum
@@ -29,9 +30,9 @@ class PathKind(Enum):
 
 
 def named_file(text: str) -> tuple[str, str]:
-    """Return name and file of NAME=FILE; without a name, as in a/b=c, the name is ""."""
+    """Return name and file of NAME=FILE; without a name, as in a/b=c or a file a=b, it is ""."""
     name, _, file = text.partition("=")
-    return (name, file) if file and "/" not in name else ("", text)
+    return ("", text) if not file or "/" in name or os.path.exists(text) else (name, file)
 
 
 Processes = Annotated[int, Range(1, 1024)]
@@ -60,8 +61,7 @@ Trajectories = tuple[Trajectory, ...]
 Run = Annotated[Path, PathKind.RUN]
 Folder = Annotated[Path, PathKind.FOLDER]
 
-COMMANDS: dict[str, type[Any]] = {}
-"""The flags of each command, by its name."""
+COMMANDS: dict[str, type[Any]] = {}  # the flags of each command, by its name
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))

@@ -206,7 +206,8 @@ def exit_code(name: str, work: Callable[[], None]) -> int:
     except OSError as error:
         if error.errno not in (*_FULL, *_REFUSALS):
             raise
-        _drop(sys.stdout)
+        if error.filename is None:
+            _drop(sys.stdout)
         what = "cannot write" if error.errno in _FULL else "this machine refuses"
         code, text = 1, f"{what} {error.filename or 'the output'}: {error.strerror}"
     except BrokenExecutor as error:

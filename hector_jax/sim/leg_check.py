@@ -36,7 +36,7 @@ class Stand(NamedTuple):
     error: Float[np.ndarray, " feet"]  # [m/s]: usual speed of the sole's points, and their height
 
 
-class Guess(NamedTuple):
+class LogChange(NamedTuple):
     """A change of the log; `{}` in its words is for the joints of the feet that it mends."""
 
     words: str
@@ -46,12 +46,12 @@ class Guess(NamedTuple):
 
 
 def slope(x: Float[np.ndarray, "n ..."], period: float) -> Float[np.ndarray, "m ..."]:
-    """Return derivatives, in the middle of each span of `span_of`."""
-    span = span_of(period)
+    """Return derivatives, in the middle of each span of `samples_of`."""
+    span = samples_of(period)
     return (x[span:] - x[:-span]) / (span * period)
 
 
-def span_of(period: float) -> int:
+def samples_of(period: float) -> int:
     """Return the number of samples in about 20 ms."""
     return max(round(0.02 / period), 2)
 
@@ -75,7 +75,7 @@ def _stand(
     soles: np.ndarray, R: np.ndarray, position: np.ndarray, stance: np.ndarray, period: float
 ) -> Stand:
     points = np.einsum("tij,tfpj->tfpi", R, soles) + position[:, None, None]
-    span, found = span_of(period), np.zeros((3, stance.shape[1]))
+    span, found = samples_of(period), np.zeros((3, stance.shape[1]))
     windows = np.lib.stride_tricks.sliding_window_view(stance, 2 * span + 1, axis=0)
     standing = np.asarray(windows.all(axis=-1))
     velocity = slope(points, period)[span // 2 :][: len(standing)]
@@ -112,27 +112,29 @@ class _Tried(NamedTuple):
         return _stand(soles, log.R, log.walk.state.position, log.stance, float(log.walk.period))
 
 
-def _in_a_leg(log: _Tried) -> Iterator[Guess]:
+def _in_a_leg(log: _Tried) -> Iterator[LogChange]:
     """Yield changes that each leg has for itself."""
     by_leg, every = log.by_leg, np.ones(log.by_leg.shape[1], bool)
     count = by_leg.shape[2]
     if np.abs(by_leg).max() > 2.0 * np.pi:
         joints = tuple(range(count))
-        yield Guess("the joints {} are in degrees", every, log.stand(np.radians(by_leg)), joints)
+        yield LogChange(
+            "the joints {} are in degrees", every, log.stand(np.radians(by_leg)), joints
+        )
         return
     for i in range(count):
         signs = np.where(np.arange(count) == i, -1.0, 1.0)
         words = "the sign of {} is the other one"
-        yield Guess(words, every, log.stand(by_leg * signs), (i,))
+        yield LogChange(words, every, log.stand(by_leg * signs), (i,))
     for i, j in combinations(range(count), 2):
         order = np.arange(count)
         order[[i, j]] = j, i
-        yield Guess("{} are exchanged", every, log.stand(by_leg[:, :, order]), (i, j))
+        yield LogChange("{} are exchanged", every, log.stand(by_leg[:, :, order]), (i, j))
     words = "the joints {} are in the order from the foot up"
-    yield Guess(words, every, log.stand(by_leg[:, :, ::-1]), tuple(range(count)))
+    yield LogChange(words, every, log.stand(by_leg[:, :, ::-1]), tuple(range(count)))
 
 
-def _of_legs(log: _Tried) -> Iterator[Guess]:
+def _of_legs(log: _Tried) -> Iterator[LogChange]:
     """Yield other orders of the legs, and joints that two legs exchange."""
     legs, count = log.by_leg.shape[1:]
     names, joints = log.robot.description.legs, log.robot.description.joints
@@ -156,21 +158,21 @@ def _of_legs(log: _Tried) -> Iterator[Guess]:
             words = f"the legs are in the order {logged}"
             if (order == pairs).all():
                 words = "left and right legs are exchanged"
-            yield Guess(words + too, order != foot, Stand(*table[:, foot, order]))
+            yield LogChange(words + too, order != foot, Stand(*table[:, foot, order]))
     for i in range(count):
         table = by_source(slice(i, i + 1))
         for a, b in combinations(range(legs), 2):
             order = np.where(foot == a, b, np.where(foot == b, a, foot))
             words = f"{joints[a * count + i]} and {joints[b * count + i]} are exchanged"
-            yield Guess(words, order != foot, Stand(*table[:, foot, order]))
+            yield LogChange(words, order != foot, Stand(*table[:, foot, order]))
 
 
-def _of_time_and_angles(log: _Tried) -> Iterator[Guess]:
+def _of_time_and_angles(log: _Tried) -> Iterator[LogChange]:
     """Yield another order of the trunk's angles, and joints and states that are late."""
     state, period = log.walk.state, float(log.walk.period)
     every = np.ones(log.by_leg.shape[1], bool)
     R = np.asarray(jax.vmap(rotation_from_euler)(state.euler[:, ::-1]))
-    yield Guess("the angles are yaw, pitch, roll", every, log.stand(R=R))
+    yield LogChange("the angles are yaw, pitch, roll", every, log.stand(R=R))
     soles = np.asarray(_soles(log.robot, log.by_leg.reshape(len(log.R), -1)))
     step = max(round(SHIFT / period), 1)
     for n in range(step, round(LATEST / period) + 1, step):
@@ -181,14 +183,14 @@ def _of_time_and_angles(log: _Tried) -> Iterator[Guess]:
         ):
             # the plan's contacts are those of what is in time
             stand = _stand(soles[at], log.R[of], state.position[of], log.stance[:-n], period)
-            yield Guess(words, every, stand)
+            yield LogChange(words, every, stand)
 
 
 def _rms(x: np.ndarray) -> float:
     return float(np.sqrt(np.mean(x**2)))
 
 
-def _mended(guess: Guess, as_is: Stand, known: np.ndarray) -> np.ndarray:
+def _mended(guess: LogChange, as_is: Stand, known: np.ndarray) -> np.ndarray:
     """Return the feet that a guess mends; none if it is not much better."""
     feet = guess.feet & known
     if guess.joints:
@@ -198,7 +200,7 @@ def _mended(guess: Guess, as_is: Stand, known: np.ndarray) -> np.ndarray:
     return feet & (_rms(guess.stand.slide[feet]) < 1.1 * _rms(as_is.slide[feet]))
 
 
-def _told(guess: Guess, robot: Robot, feet: np.ndarray) -> str:
+def _told(guess: LogChange, robot: Robot, feet: np.ndarray) -> str:
     """Return the words of a guess for the feet that it mends."""
     names, count = robot.description.joints, robot.description.leg_joints
     legs = [0] if feet.all() else np.flatnonzero(feet)
@@ -235,7 +237,7 @@ def legs_found(robot: Robot, walk: Trajectory, stance: Bool[np.ndarray, "n feet"
         named = "" if feet.all() else f" ({', '.join(x for x in np.array(legs)[feet])})"
         return f"by the joints, feet that stand{named}"
 
-    guesses: list[Guess] = []
+    guesses: list[LogChange] = []
     if (as_is.error[known] > UNSTEADY).any():
         guesses = [x for ask in (_in_a_leg, _of_legs, _of_time_and_angles) for x in ask(log)]
     while (as_is.error[known] > UNSTEADY).any():

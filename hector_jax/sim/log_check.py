@@ -19,7 +19,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import SOLVED, State, Trajectory
 from hector_jax.robot.model import Robot
 from hector_jax.sim.diagnosis import FALLING, MOST_AT_LIMIT, STEADY, lasting, motors, steady_height
-from hector_jax.sim.leg_check import BETTER, legs_found, slope, span_of
+from hector_jax.sim.leg_check import BETTER, legs_found, samples_of, slope
 from hector_jax.sim.walk_file import check_legs, read_entries, read_walk, reference_of
 
 SETTLED, SHORTEST = 0.5, 1.0  # [s] after t = 0; of a walk from then on
@@ -132,7 +132,7 @@ def check_log(log: CheckedLog, tick: float) -> list[str]:
 
 def _middle(x: Float[np.ndarray, "n ..."], period: float) -> Float[np.ndarray, "m ..."]:
     """Return the means over the spans of `slope`."""
-    span, sums = span_of(period), np.cumsum(x, axis=0)
+    span, sums = samples_of(period), np.cumsum(x, axis=0)
     return (sums[span:] - sums[:-span]) / span
 
 
