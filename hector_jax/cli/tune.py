@@ -14,7 +14,7 @@ import numpy as np
 from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import BASELINES, Tune, Walk
-from hector_jax.cli.parse import as_command
+from hector_jax.cli.parse import as_command, latest_run
 from hector_jax.cli.verdict import small_verdict
 from hector_jax.cli.walker import tune_walker
 from hector_jax.control.parameters import leg_numbers, model_numbers, step_names
@@ -202,8 +202,8 @@ def _print(
     show_elsewhere: Callable[[], None] | None,
 ) -> None:
     """Print the result of a run."""
-    in_runs = Path("runs").resolve() in run.folder.resolve().parents
-    text = "latest" if in_runs else str(run.folder)
+    newest = latest_run()
+    text = "latest" if newest and newest.samefile(run.folder) else str(run.folder)
 
     def print_text() -> None:
         print(*first_lines(by_name[run.name], text), "", sep="\n")
