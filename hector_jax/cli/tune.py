@@ -333,8 +333,8 @@ def _say_worse(name: str, on_hfs: ScoredWalks) -> None:
     for tuned in ("without", "with", "best"):
         if L.get(tuned, 0.0) > 1.05 * L["nominal"]:  # less says nothing, of one walk
             say(
-                f"{name}: on the high-fidelity simulator `{tuned}` walks with L {L[tuned]:.3g}, "
-                f"nominal with {L['nominal']:.3g}: the model or the loss may not fit this robot"
+                f"{name}: on the high-fidelity simulator `{tuned}` has L {L[tuned] / 1e6:.3g}e6, "
+                f"nominal {L['nominal'] / 1e6:.3g}e6: the model or the loss may not fit this robot"
             )
 
 

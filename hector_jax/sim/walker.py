@@ -76,7 +76,7 @@ def walker_of(path: Path, limit: float, uses: Sequence[Path] = ()) -> Walker:
     files = {file: file.relative_to(path.parent) for file in _imports(path)}
     for place in uses:
         if not place.exists():
-            raise InputError(f"walker-uses {place}: no such file or folder")
+            raise InputError(f"--walker-uses {place}: no such file or folder")
         files |= _files(place.resolve())
     named = sorted((name.parts, file.read_bytes()) for file, name in files.items())
     return Walker(path, limit, hashlib.sha256(repr(named).encode()).hexdigest()[:16])
