@@ -132,7 +132,7 @@ def test_every_number_that_the_plan_reads_has_a_derivative_and_compiles_nothing(
         compiled.append(1)
 
         def force(parameters):
-            decided, _ = plan(
+            decided = plan(
                 CONFIG,
                 ROBOT,
                 parameters,

@@ -5,26 +5,33 @@ import numpy as np
 import pytest
 from model import AHEAD, ANCHOR, BRIEF, PLAIN, ROBOT
 
+from hector_jax.control.reference import named_command
 from hector_jax.control.weights import nominal, vector_to_weights, weights_to_vector
+from hector_jax.control.weights_file import best
+from hector_jax.core.geometry import rot_z
 from hector_jax.core.trajectory import State, Wrench, no_samples
+from hector_jax.sim.loop import Job
+from hector_jax.sim.walk import walk
+from hector_jax.sim.world import hfs
 from hector_jax.tuning.curvature import gauss_newton_jit
 from hector_jax.tuning.evaluate import evaluate_jit
 from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
 from hector_jax.tuning.loss import PAPER_LOSS
 from hector_jax.tuning.rollout import Scenario
+from hector_jax.verdict.choice import drawn_plants
 
 SCENARIO = Scenario(ROBOT, AHEAD, ANCHOR, PLAIN)
 
 
-@pytest.fixture(scope="module")
-def measured():
+def shaking(size):
     """A walk that the model does not explain: a robot that only stands, and shakes."""
     ticks, rng = BRIEF.ticks, np.random.default_rng(0)
     place = np.append(np.asarray(ROBOT.com_offset)[:2], ROBOT.standing_height)
-    shake = 1e-3 * rng.standard_normal((ticks, 3))
+    shake = size * rng.standard_normal((ticks, 3))
     state = State(shake, shake + place, shake, shake)
     force = np.broadcast_to(np.asarray(ROBOT.mass * ROBOT.gravity) / 2, (ticks, 2, 3))
-    return no_samples(10, 2)._replace(
+    empty = no_samples(10, 2)
+    return empty._replace(
         period=np.array(0.01),
         initial=jax.tree.map(lambda x: x[0] - shake[0], state),
         state=state,
@@ -32,6 +39,28 @@ def measured():
         joints=np.broadcast_to(ROBOT.standing_joints, (ticks, 10)),
         fallen=np.zeros(ticks, bool),
         residual=np.zeros(ticks),
+        belief=jax.tree.map(lambda x: np.zeros((ticks, *x.shape[1:])), empty.belief),
+    )
+
+
+@pytest.fixture(scope="module")
+def measured():
+    return shaking(1e-3)
+
+
+def from_yaw(walk, yaw):
+    """The same walk of a robot that begins with another heading [rad]."""
+    R = np.asarray(rot_z(yaw))
+
+    def turned(state):
+        vectors = (x @ R.T for x in (state.position, state.ang_velocity, state.velocity))
+        position, rates, velocity = vectors
+        return State(state.euler + [0.0, 0.0, yaw], position, rates, velocity)
+
+    return walk._replace(
+        initial=turned(walk.initial),
+        state=turned(walk.state),
+        command=Wrench(walk.command.force @ R.T, walk.command.moment @ R.T),
     )
 
 
@@ -72,3 +101,34 @@ def test_its_matrix_has_a_row_for_each_tuned_number_and_is_positive(grounding):
     assert matrix.shape == (19, 19)
     np.testing.assert_allclose(matrix, matrix.T, rtol=1e-9, atol=1e-9 * np.abs(matrix).max())
     assert np.linalg.eigvalsh(matrix)[0] > -1e-9 * np.abs(matrix).max()
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_with_the_weights_of_a_log_the_planned_commands_are_those_of_the_log(noise):
+    """With integral action, whose memory is not empty when the log begins, and a wrong estimate."""
+    config, weights, command = BRIEF.walk, best(), named_command("s")
+    plant = drawn_plants(ROBOT, 1)[0] if noise else hfs()
+    seconds = BRIEF.ticks * config.gait.tick
+    walked = walk(config, ROBOT, Job(weights, command, plant, seconds, seed=3))
+    stride = round(config.gait.tick / float(walked.period))
+    log = jax.tree.map(
+        lambda x: x[stride - 1 :: stride], walked._replace(period=None, initial=None)
+    )
+    log = log._replace(period=np.array(config.gait.tick), initial=walked.initial)
+    assert np.abs(log.belief.disturbance.linear).max() > 0.1
+    assert np.any(log.belief.state.position) == noise
+    grounding = fit_grounding(BRIEF, Scenario(ROBOT, command, ANCHOR, PLAIN), weights, log)
+    again = jax.jit(grounded_rollout, static_argnums=0)(BRIEF, grounding, weights)
+    for found, there in zip(again.command, log.command, strict=True):
+        np.testing.assert_allclose(found, there[1:], atol=1e-6)
+
+
+def test_residuals_turn_with_the_robot():
+    """An error of the model that is the same for the robot is the same at each heading."""
+    walks = shaking(1e-2), from_yaw(shaking(1e-2), 0.7)
+    found, there = (fit_grounding(BRIEF, SCENARIO, nominal(), x) for x in walks)
+    assert np.abs(there.residuals.state.velocity).max() > 1e-2
+    for a, b in zip(
+        jax.tree.leaves(found.residuals), jax.tree.leaves(there.residuals), strict=True
+    ):
+        np.testing.assert_allclose(a, b, atol=1e-3)

@@ -24,14 +24,14 @@ from hector_jax.control.contact import (
     StateConstraint,
     StateCost,
 )
-from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
+from hector_jax.control.disturbance import NO_DISTURBANCE
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, build_qp, solve_mpc
 from hector_jax.control.parameters import bounds
 from hector_jax.control.weights import Weights, expert, vector_to_weights, weights_to_vector
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import from_table, to_table
-from hector_jax.core.trajectory import State, pack_wrench
+from hector_jax.core.trajectory import Disturbance, State, pack_wrench
 from hector_jax.qp import QP, Status, solve_qp
 from hector_jax.robot import srbm
 from hector_jax.robot.model import load_robot

@@ -53,7 +53,7 @@ def planned(config, tick=5, last=None):
         feet=FEET,
         last=last,
         max_contacts=both,
-    )[0]
+    )
 
 
 def twin(**changes):

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hector_jax.control import footstep, gait, legs
-from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance, integrate_error
+from hector_jax.control.disturbance import NO_DISTURBANCE, integrate_error
 from hector_jax.control.footstep import Feet, FootstepConfig, FootstepParameters
 from hector_jax.control.gait import PATTERNS, GaitConfig
 from hector_jax.control.legs import LegConfig, LegParameters, Measurement
@@ -30,7 +30,7 @@ from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rotation_from_euler, wrap_angle
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import check, from_table
-from hector_jax.core.trajectory import State, Wrench
+from hector_jax.core.trajectory import Disturbance, State, Wrench
 from hector_jax.qp import Solution
 from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.mjcf import TIME_STEP
@@ -133,6 +133,8 @@ class Plan(NamedTuple):
     swing_ticks: Int[Array, "*batch feet"]  # since lift-off
     residual: Float[Array, "*batch"]  # largest relative KKT residual of the QP
     status: Int[Array, "*batch"]  # of the QP, see `qp.Status`
+    disturbance: Disturbance  # for the next plan
+    measured: Measurement | None = None  # from which `step_plan` planned
 
 
 def contacts_needed(config: WalkConfig, tick: int) -> int:
@@ -233,7 +235,7 @@ def plan(
     last: Wrench | None = None,
     desired: State | None = None,
     max_contacts: int = 1,
-) -> tuple[Plan, Disturbance]:
+) -> Plan:
     """Solve the MPC for one tick.
 
     Args:
@@ -248,7 +250,7 @@ def plan(
         max_contacts: from `contacts_needed` (static).
 
     Returns:
-        The commanded wrench with the planned touchdowns, and the disturbance for the next plan.
+        The commanded wrench, the planned touchdowns, and the disturbance for the next plan.
 
     Source: Eq. 3-6.
     """
@@ -277,7 +279,7 @@ def plan(
     residual = jnp.maximum(residual, solution.gap)
     if config.twin != TwinConfig():  # a foot in the air exerts nothing
         wrench = jax.tree.map(lambda x: contact[:, None] * x, wrench)
-    return Plan(wrench, contact, touchdown, swing_ticks, residual, solution.status), disturbance
+    return Plan(wrench, contact, touchdown, swing_ticks, residual, solution.status, disturbance)
 
 
 def _solve_or_keep(
@@ -330,7 +332,7 @@ def step_plan(
     now = {"feet": feet.position, "tick": tick}
     grip = feel(config.slip, config.gait, robot.standing_height, memory.grip, **now)
     mpc = parameters.mpc._replace(friction=(1.0 - grip.lost) * parameters.mpc.friction)
-    planned, disturbance = plan(
+    planned = plan(
         config,
         robot,
         parameters._replace(mpc=mpc),
@@ -344,7 +346,8 @@ def step_plan(
         max_contacts=max_contacts,
     )
     liftoff = footstep.feet_where(planned.contact, feet, memory.liftoff)
-    return Memory(liftoff, disturbance, grip, planned.wrench), planned
+    memory = Memory(liftoff, planned.disturbance, grip, planned.wrench)
+    return memory, planned._replace(measured=measurement)
 
 
 def actuate(

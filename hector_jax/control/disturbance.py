@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from hector_jax.core.arrays import Array, contract
 from hector_jax.core.geometry import rot_z
-from hector_jax.core.trajectory import State
+from hector_jax.core.trajectory import Disturbance, State
 
 _LARGE = 0.05  # e0 [m] and [rad]: a larger error counts less the larger it is
 
@@ -27,13 +27,6 @@ class IntegralGains(NamedTuple):
     height: Any
     tilt: Any  # of roll and pitch
     yaw: Any
-
-
-class Disturbance(NamedTuple):
-    """Accelerations that are missing in the model, in the yaw frame."""
-
-    linear: Float[Array, "*batch 3"]  # [m/s^2]
-    angular: Float[Array, "*batch 3"]  # [rad/s^2]
 
 
 NO_DISTURBANCE = Disturbance(np.zeros(3), np.zeros(3))

@@ -36,13 +36,13 @@ from hector_jax.control.contact import (
     Step,
     rows,
 )
-from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance, IntegralGains
+from hector_jax.control.disturbance import NO_DISTURBANCE, IntegralGains
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array, contract
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SHARE, Range, check
-from hector_jax.core.trajectory import State, Wrench, pack_wrench, unpack_wrench
+from hector_jax.core.trajectory import Disturbance, State, Wrench, pack_wrench, unpack_wrench
 from hector_jax.qp import QP, QpConfig, Solution, block_diagonal, solve_qp
 from hector_jax.robot import srbm
 from hector_jax.robot.model import Robot

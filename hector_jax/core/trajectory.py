@@ -47,6 +47,21 @@ class Load(NamedTuple):
     torque: Float[Any, "*batch 3"]  # [N m]
 
 
+class Disturbance(NamedTuple):
+    """Accelerations that are missing in the model of the controller, in the yaw frame."""
+
+    linear: Float[Any, "*batch 3"]  # [m/s^2]
+    angular: Float[Any, "*batch 3"]  # [rad/s^2]
+
+
+class Belief(NamedTuple):
+    """What the controller planned from, beside the truth: with it each plan can be made again."""
+
+    state: State  # (T, 3) each, error of the estimate when the plan was made
+    joints: Float[Any, "*batch T joints"]  # [rad] error of the encoders, backlash included
+    disturbance: Disturbance  # (T, 3) each, of the integral action, after the plan
+
+
 class Trajectory(NamedTuple):
     """One walk, sampled at a constant rate, as every world returns it.
 
@@ -67,6 +82,7 @@ class Trajectory(NamedTuple):
     fallen: Bool[Any, "*batch T"]  # true from the sample of the fall on
     legs_touch: Bool[Any, "*batch T"]  # the legs touched each other, which is not a fall
     residual: Float[Any, "*batch T"]  # largest relative KKT residual of the current plan
+    belief: Belief | None = None  # None: of a model, whose variation tells it
 
 
 def no_samples(joints: int, feet: int, *batch: int) -> Trajectory:
@@ -87,6 +103,7 @@ def no_samples(joints: int, feet: int, *batch: int) -> Trajectory:
         fallen=zeros(0),
         legs_touch=zeros(0),
         residual=zeros(0),
+        belief=Belief(state, zeros(0, joints), Disturbance(zeros(0, 3), zeros(0, 3))),
     )
 
 
@@ -101,9 +118,11 @@ def from_start(walk: Trajectory) -> Trajectory:
     yaw[2], origin[:2] = walk.initial.euler[2], walk.initial.position[:2]
     R = np.asarray(rot_z(jnp.asarray(yaw[2])))  # v @ R rotates v by -yaw
 
-    def transform(state: State) -> State:
+    def transform(state: State, yaw: Any = yaw, origin: Any = origin) -> State:
         position = (state.position - origin) @ R
         return State(state.euler - yaw, position, state.ang_velocity @ R, state.velocity @ R)
+
+    belief = walk.belief and walk.belief._replace(state=transform(walk.belief.state, 0.0, 0.0))
 
     return walk._replace(
         initial=transform(walk.initial),
@@ -112,6 +131,7 @@ def from_start(walk: Trajectory) -> Trajectory:
         command=Wrench(*(vectors @ R for vectors in walk.command)),
         effect=Wrench(*(vectors @ R for vectors in walk.effect)),
         feet=(walk.feet - origin) @ R,
+        belief=belief,
     )
 
 

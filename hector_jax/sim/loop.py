@@ -9,6 +9,7 @@ and `sample` returns the true state. An engine gives its coordinates as a flat r
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
@@ -18,7 +19,7 @@ from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
-from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
+from hector_jax.core.trajectory import Belief, State, Trajectory, Wrench, has_fallen
 from hector_jax.robot.checks import expect
 from hector_jax.robot.description import Description
 from hector_jax.robot.mjcf import TIME_STEP
@@ -124,16 +125,31 @@ def sample(
 
 
 def as_trajectory(
-    period: Float[Array | np.ndarray, ""], initial: State, plan: Plan, samples: Sample
+    period: Float[Array | np.ndarray, ""], plans: Plan, samples: Sample, rate: int
 ) -> Trajectory:
-    """Return the trajectory of samples, each with the plan in force."""
+    """Return the trajectory of the samples after the first, each with the plan in force.
+
+    Args:
+        period: of the samples [s].
+        plans: of the ticks.
+        samples: that before the first tick, then those of the ticks.
+        rate: number of samples in a tick.
+    """
+    measured = plans.measured
+    assert measured is not None  # by `step_plan`
+    starts = jax.tree.map(lambda x: x[:-1:rate], samples)
+    errors = jax.tree.map(lambda x, true: x - true, measured.state, starts.state)
+    belief = Belief(errors, measured.joints - starts.joints, plans.disturbance)
+    held = plans.wrench, plans.contact, plans.residual, belief
+    command, contact, residual, belief = jax.tree.map(lambda x: x.repeat(rate, axis=0), held)
     return Trajectory(
         period=period,
-        initial=initial,
-        command=plan.wrench,
-        contact=plan.contact,
-        residual=plan.residual,
-        **samples._asdict(),
+        initial=jax.tree.map(lambda x: x[0], samples.state),
+        command=command,
+        contact=contact,
+        residual=residual,
+        belief=belief,
+        **jax.tree.map(lambda x: x[1:], samples)._asdict(),
     )
 
 

@@ -259,13 +259,12 @@ def _walk_one(
     _, (plans, samples) = jax.lax.scan(partial(_tick, program, walk), carry, ticks)
 
     # The part of this walk from its t = 0 on; `rate` is the number of samples in a tick.
-    lead = (job.start_tick - begin) * rate
-    plans = jax.tree.map(lambda x: jnp.repeat(x, rate, axis=0), plans)
+    lead = job.start_tick - begin
     samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
-    initial = jax.tree.map(lambda x: x[lead - 1], samples.state)
-    cut = partial(jax.lax.dynamic_slice_in_dim, start_index=lead, slice_size=program.ticks * rate)
-    plans, samples = jax.tree.map(cut, (plans, samples))
-    return loop.as_trajectory(jnp.asarray(TIME_STEP * program.period), initial, plans, samples)
+    cut, count = jax.lax.dynamic_slice_in_dim, program.ticks
+    plans = jax.tree.map(lambda x: cut(x, lead, count), plans)
+    samples = jax.tree.map(lambda x: cut(x, lead * rate - 1, count * rate + 1), samples)
+    return loop.as_trajectory(jnp.asarray(TIME_STEP * program.period), plans, samples, rate)
 
 
 @partial(jax.jit, static_argnames="program")

@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from hector_jax.control.controller import WalkConfig, contacts_needed, measured_feet, plan
-from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
+from hector_jax.control.disturbance import NO_DISTURBANCE
 from hector_jax.control.legs import Measurement
 from hector_jax.control.reference import Command, anchor_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
-from hector_jax.core.trajectory import SOLVED, Trajectory, Wrench
+from hector_jax.core.trajectory import SOLVED, Disturbance, Trajectory, Wrench
 from hector_jax.robot.model import Robot
 from hector_jax.sim.walk_file import check_legs
 
@@ -101,7 +101,7 @@ def _plans(
     def one(disturbance: Disturbance, inputs: tuple) -> tuple[Disturbance, tuple]:
         desired, state, joints, tick = inputs
         feet = measured_feet(robot, Measurement(state, joints, jnp.zeros_like(joints)))
-        planned, disturbance = plan(
+        planned = plan(
             config,
             robot,
             parameters,
@@ -114,7 +114,7 @@ def _plans(
             desired=desired,
             max_contacts=contacts_needed(config, 0),
         )
-        return disturbance, (planned.wrench, planned.contact, planned.residual)
+        return planned.disturbance, (planned.wrench, planned.contact, planned.residual)
 
     _, planned = jax.lax.scan(one, NO_DISTURBANCE, (own, *plans))
     return planned

@@ -188,19 +188,18 @@ def walk(
     count, ticks = substeps(config), loop.walk_ticks(config, job.seconds, job.start_tick)
     lead, length = (job.start_tick - first_tick(config)) * count, ticks * count
     plant = build(job, job.body(robot), -lead, length)
-    plan, flat = _simulate(config, robot, job, plant, ticks=ticks)
+    plans, flat = _simulate(config, robot, job, plant, ticks=ticks)
     # from a fall on, samples repeat the last valid one
     fell, good = np.flatnonzero(flat.fallen), len(flat.fallen) - 1
     if len(fell):
         good = max(fell[0] - 1, 0)
     elif plant.broken:  # the engine warned within the last tick and the state does not show it
         good = max(len(flat.fallen) - count - 1, 0)
-    steps = lead + np.arange(length)
+    steps = lead - 1 + np.arange(length + 1)
     rows = np.minimum(steps, good)
-    initial = jax.tree.map(lambda x: x[min(lead - 1, good)], flat.state)
-    plan = jax.tree.map(lambda x: x[rows // count], plan)
-    chosen = jax.tree.map(lambda x: x[rows], flat)._replace(fallen=steps > good)
-    return loop.as_trajectory(np.array(TIME_STEP), initial, plan, chosen)
+    plans = jax.tree.map(lambda x: x[rows[1::count] // count], plans)
+    samples = jax.tree.map(lambda x: x[rows], flat)._replace(fallen=steps > good)
+    return loop.as_trajectory(np.array(TIME_STEP), plans, samples, count)
 
 
 def _simulate(

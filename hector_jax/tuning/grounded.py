@@ -10,17 +10,17 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from hector_jax import qp
 from hector_jax.control.controller import measured_feet
-from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
 from hector_jax.control.footstep import Feet
 from hector_jax.control.legs import Measurement
 from hector_jax.control.reference import Anchor, anchor_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
-from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
+from hector_jax.core.geometry import rot_z
+from hector_jax.core.trajectory import Disturbance, State, Trajectory, Wrench, has_fallen
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.rollout import (
     Carry,
@@ -54,13 +54,15 @@ def carry_from(
 class Grounding(NamedTuple):
     """The model with start and residuals of rollouts grounded on a measured walk of T ticks.
 
-    Estimates are not used: commands are planned anew, from the true states of the walk.
+    Commands are planned anew, with the errors that the estimate of state and feet had in the walk.
     """
 
     scenario: Scenario  # with the nominal body and the command and the anchor of the walk
     start: Carry  # at the end of the first tick
     tick: Int[Array, ""]  # gait tick at the start
-    residuals: MeasuredState  # (T - 1, ...) measured less modelled values at the end of a tick
+    errors: MeasuredState  # (T - 1, ...) estimated less true values at the start of a tick
+    # (T - 1, ...) measured less modelled values at the end of a tick, in the yaw frame at its start
+    residuals: MeasuredState
 
 
 @partial(jax.jit, static_argnums=0)
@@ -77,7 +79,8 @@ def fit_grounding(
         config: controller, and the T ticks of the walk.
         scenario: nominal body, phi and command; the walk gives the anchor.
         weights: of the walk.
-        walk: true states, joints and commands, sampled at the plan interval: T samples.
+        walk: true states, joints, commands and what the controller believed, sampled at the plan
+            interval: T samples.
         start_tick: gait tick of t = 0.
 
     Raises:
@@ -85,23 +88,38 @@ def fit_grounding(
 
     Source: Eq. 12, 13 at the measured states.
     """
-    robot = scenario.robot
-    measured = measured_states(robot, walk.state, walk.joints)
-    first, command_before = jax.tree.map(lambda x: x[0], (measured, walk.command))
+    robot, belief = scenario.robot, walk.belief
+    assert belief is not None  # zero in a log without it
+    true = measured_states(robot, walk.state, walk.joints)
+    first, command_before = jax.tree.map(lambda x: x[0], (true, walk.command))
     anchor, tick = anchor_at(robot, walk.initial, start_tick), jnp.asarray(start_tick) + 1
+    begins, ends = jax.tree.map(lambda x: x[:-1], true), jax.tree.map(lambda x: x[1:], true)
+    begin_joints, (state, joints) = walk.joints[:-1], jax.tree.map(lambda x: x[1:], belief[:2])
+    estimated = jax.tree.map(jnp.add, begins.state, state)
+    errors = jax.tree.map(
+        jnp.subtract, measured_states(robot, estimated, begin_joints + joints), begins
+    )
 
     def step(memory: tuple[Wrench, Disturbance], inputs: tuple) -> tuple[tuple, MeasuredState]:
-        begin, end, tick = inputs
+        begin, end, error, tick = inputs
         carry = carry_from(begin, anchor, *memory)
-        after, _ = step_carry(config, scenario, weights, carry, tick)
+        after, _ = step_carry(config, scenario, weights, carry, tick, error=error)
         residual = jax.tree.map(jnp.subtract, end, MeasuredState(after.state, after.feet))
-        return (after.commands, after.disturbance), residual
+        return (after.commands, after.disturbance), _turned(residual, -begin.state.euler[2])
 
-    begins, ends = jax.tree.map(lambda x: x[:-1], measured), jax.tree.map(lambda x: x[1:], measured)
-    memory = command_history(command_before), NO_DISTURBANCE
-    _, residuals = jax.lax.scan(step, memory, (begins, ends, tick + jnp.arange(config.ticks - 1)))
+    disturbance = jax.tree.map(lambda x: x[0], belief.disturbance)
+    memory, ticks = (command_history(command_before), disturbance), tick + jnp.arange(len(joints))
+    _, residuals = jax.lax.scan(step, memory, (begins, ends, errors, ticks))
     start = carry_from(first, anchor, *memory)
-    return Grounding(scenario._replace(anchor=anchor), start, tick, residuals)
+    return Grounding(scenario._replace(anchor=anchor), start, tick, errors, residuals)
+
+
+def _turned(x: MeasuredState, yaw: Float[Array, ""]) -> MeasuredState:
+    """Return differences of states and feet turned by a yaw [rad]; angles stay."""
+    R, state = rot_z(yaw), x.state
+    position, rates, velocity = (v @ R.T for v in (state[1], *state[2:]))
+    feet = x.feet._replace(position=x.feet.position @ R.T)
+    return MeasuredState(State(state.euler, position, rates, velocity), feet)
 
 
 def grounded_rollout(config: RolloutConfig, grounding: Grounding, weights: Weights) -> Trajectory:
@@ -117,17 +135,18 @@ def grounded_rollout(config: RolloutConfig, grounding: Grounding, weights: Weigh
 
     Source: Eq. 12, 13 and the measured residuals.
     """
-    scenario, start, tick, residuals = grounding
+    scenario, start, tick, errors, residuals = grounding
 
     @partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(qp.SAVED))
     def step(carry: Carry, inputs: tuple) -> tuple[Carry, Trajectory]:
-        residual, tick = inputs
-        after, sample = step_carry(config, scenario, weights, carry, tick)
+        error, residual, tick = inputs
+        after, sample = step_carry(config, scenario, weights, carry, tick, error=error)
+        residual = _turned(residual, carry.state.euler[2])
         state, feet = jax.tree.map(jnp.add, MeasuredState(after.state, after.feet), residual)
         fallen = carry.fallen | has_fallen(state, *scenario.robot.description.limits)
         after = after._replace(state=state, feet=feet, fallen=fallen)
         return after, sample._replace(state=state, feet=feet.position, fallen=fallen)
 
     ticks = tick + jnp.arange(len(residuals.feet.yaw))
-    _, samples = jax.lax.scan(step, start, (residuals, ticks))
+    _, samples = jax.lax.scan(step, start, (errors, residuals, ticks))
     return samples._replace(initial=start.state, period=jnp.asarray(config.walk.gait.tick))

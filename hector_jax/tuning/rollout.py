@@ -23,14 +23,14 @@ from hector_jax.control.controller import (
     standing_wrench,
     walk_config,
 )
-from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
+from hector_jax.control.disturbance import NO_DISTURBANCE
 from hector_jax.control.footstep import Feet, feet_where
 from hector_jax.control.reference import Anchor, Command, anchor_at, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, Range, check
-from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
+from hector_jax.core.trajectory import Disturbance, State, Trajectory, Wrench, has_fallen
 from hector_jax.core.tree import layout, pack, unpack, where
 from hector_jax.grfm.effect import HISTORY, Effect, Window, from_yaw_frame, ground_effect, turn
 from hector_jax.robot import srbm
@@ -205,26 +205,30 @@ def step_carry(
     tick: Int[Array, ""],
     *,
     wrench: Wrench | None = None,
+    error: tuple[State, Feet] | None = None,
 ) -> tuple[Carry, Trajectory]:
     """Walk one tick of the closed loop: plan, effect, motion.
 
     Returns the next carry and the tick's sample of the trajectory. A `wrench` takes the place of
-    the planned one. The anchor is that of the carry.
+    the planned one, and `error` is that of the estimated state and feet in place of a variation's.
+    The anchor is that of the carry.
     """
     robot, command, _, effect, variation = scenario
     walk, dt = config.walk, config.walk.gait.tick
     new_anchor = anchor_at(robot, carry.state, carry.anchor.tick)
     anchor = where(tick == new_anchor.tick, new_anchor, carry.anchor)
-    estimated_state, estimated_feet, error = _estimate(carry, tick, variation)
-    planned, disturbance = plan(
+    state, feet, drift = _estimate(carry, tick, variation)
+    if error is not None:
+        state, feet = jax.tree.map(jnp.add, (carry.state, carry.feet), tuple(error))
+    planned = plan(
         walk,
         robot,
         walk.parameters(weights),
         command=command,
         anchor=anchor,
         tick=tick,
-        state=estimated_state,
-        feet=estimated_feet,
+        state=state,
+        feet=feet,
         disturbance=carry.disturbance,
         last=jax.tree.map(lambda w: w[0], carry.commands),
         max_contacts=contacts_needed(walk, 0),
@@ -237,11 +241,11 @@ def step_carry(
     yaw = carry.state.euler[2]  # the frame of phi turns with it
     window = Window(turn(commands, -yaw), planned.contact, since, from_yaw_frame(carry.state))
     response = turn(effect(window), yaw)
-    response, feet = _on_real_ground(carry, response, planned, error, variation)
+    response, feet = _on_real_ground(carry, response, planned, drift, variation)
     state = _move(scenario, carry, response, feet, dt)
     fallen = carry.fallen | has_fallen(state, *robot.description.limits)
     before = None if variation is None else response
-    after = Carry(state, feet, commands, anchor, disturbance, fallen, before)
+    after = Carry(state, feet, commands, anchor, planned.disturbance, fallen, before)
     sample = _sample(
         config,
         robot,

@@ -12,7 +12,7 @@ from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights
 from hector_jax.core.inputs import InputError, one_line
 from hector_jax.core.settings import convert
-from hector_jax.core.trajectory import SOLVED, State, Trajectory, Wrench, no_samples
+from hector_jax.core.trajectory import SOLVED, Belief, State, Trajectory, Wrench, no_samples
 from hector_jax.core.tree_file import read_card, tree_hash
 from hector_jax.robot.model import Robot
 from hector_jax.sim.walk_file import read_walk, reference_of
@@ -32,6 +32,7 @@ class Log(NamedTuple):
     contact: Bool[Any, "T feet"]  # planned stance; none in a log without this entry
     fallen: Bool[Any, " T"]
     residual: Float[Any, " T"]  # of the plans
+    belief: Belief  # zero in a log without it
 
 
 class LogScore(NamedTuple):
