@@ -14,7 +14,7 @@ QUICK_TESTS := $(addprefix tests/test_,$(addsuffix .py,footstep gait legs refere
 LOCK = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --no-header \
 	--no-emit-index-url pyproject.toml
 
-.PHONY: help setup engines tune verdict grfm search test quick test-all bench check format docs lock
+.PHONY: help setup engines tune verdict grfm test quick test-all bench check format docs lock
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -42,10 +42,6 @@ verdict: $(STAMP) ## sets in all engines and models: make verdict WEIGHTS="nomin
 
 grfm: $(STAMP) ## how well the nets predict the ground forces: runs/grfm/report.md
 	@$(BIN)/hector grfm
-
-search: $(STAMP) ## search of 2000 walks for each trajectory; continues if interrupted; for a GPU
-	@$(BIN)/hector search --traj all --budget 2000 --population 40 --record runs/search_2000 \
-		--out experiments/reports/search_2000
 
 test: $(STAMP) ## the fast tests
 	@$(BIN)/pytest -q -n 2 --dist loadfile

@@ -39,8 +39,8 @@ PARTS = {
     ),
     "tuning": (
         "tuning/batch tuning/difftune tuning/step_rules tuning/curvature tuning/loss"
-        " tuning/grounded tuning/rollout tuning/variation tuning/evaluate search/cmaes",
-        "loss variation config rollout difftune step_rules curvature faults grounded search batch",
+        " tuning/grounded tuning/rollout tuning/variation tuning/evaluate",
+        "loss variation config rollout difftune step_rules curvature faults grounded batch",
     ),
     "sim": (
         "sim/actuators sim/loop sim/mjx_model sim/parallel sim/sensing sim/walk sim/world",

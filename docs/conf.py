@@ -51,7 +51,7 @@ PACKAGES = {  # in this order: title and purpose of each page of the reference
     "sim": ("Simulation", "The robot in MuJoCo, one walk at a time or in batches."),
     "grfm": ("Ground reaction net", "phi: the map from command to effect, its data and training."),
     "tuning": ("Tuning", "Rollout, loss and Gauss-Newton steps, for one problem or for many."),
-    "search": ("Search", "Tuning by walks, without derivatives or with those of a model."),
+    "search": ("Search", "Which weights to walk next, from the walks so far."),
     "store": ("Store", "What is computed once and kept: walks, nets, tunings, runs."),
     "verdict": ("Verdict", "Walks of weight sets, scores and their statistics."),
     "importing": ("Importing", "The settings of robots that others publish, by rules."),
@@ -67,7 +67,7 @@ PUBLIC = {  # of packages without `__all__`, in whichever of their modules they 
     "grfm": "Window Effect Phi as_effect load_net save_net TrainConfig train",
     "tuning": """RolloutConfig rollout LossTerm losses with_alphas TuneConfig Evaluation Tuning
         tune descend""",
-    "search": "SearchConfig search",
+    "search": "Model Space WalkResult Proposal propose",
     "store": "load_run load_walks",
     "verdict": "Score score Verdict make_verdict",
     "importing": "propose_robot standard_form",

@@ -43,7 +43,6 @@ from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import load_robot
-from hector_jax.search.cmaes import Generation, to_generation
 from hector_jax.sim.engine import Engine, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import Imperfections, named_world
@@ -111,7 +110,7 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
         InputError: cmaes is not installed, the folder has the record of another search, or a QP
             of the start is not solved.
     """
-    require_package("cmaes", "search", "a search")
+    require_package("cmaes", "race", "a search")
     from cmaes import CMA
 
     head = {
@@ -127,11 +126,11 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
     }
     size, dimensions = flags.population, len(box_of(campaign))
 
-    def parse(row: dict[str, list]) -> Generation:
-        generation = to_generation(row["steps"], row["losses"])
-        if generation.steps.shape != (size, dimensions) or generation.losses.shape != (size,):
-            raise ValueError(f"steps {generation.steps.shape}, losses {generation.losses.shape}")
-        return generation
+    def parse(row: dict[str, list]) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]:
+        steps, losses = np.array(row["steps"], float), np.array(row["losses"], float)
+        if steps.shape != (size, dimensions) or losses.shape != (size,):
+            raise ValueError(f"steps {steps.shape}, losses {losses.shape}")
+        return steps, np.where(np.isfinite(losses), losses, np.inf)  # null in the journal
 
     path = campaign.folder / "generations.jsonl"
     rows, space = (
@@ -148,8 +147,10 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
             points = np.stack([evolution.ask() for _ in range(size)])
             if number == len(rows):
                 sets = [weights_at(campaign, space, space.clip(point)) for point in points]
-                rows.append(to_generation(points, [np.mean(x / at_start) for x in losses(sets)]))
-                add_row(path, {k: v.tolist() for k, v in rows[-1]._asdict().items()})
+                means = [float(np.mean(x / at_start)) for x in losses(sets)]
+                row = {"steps": points.tolist(), "losses": means}
+                rows.append(parse(row))
+                add_row(path, row)
             # the points as they were drawn, though one outside the box walked at its edge
             steps, ratios = rows[number]
             evolution.tell(list(zip(steps, ratios.tolist(), strict=True)))

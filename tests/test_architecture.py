@@ -18,13 +18,13 @@ DOORS = {"mujoco": ("core.headless", "sim.mjx_model"), "pydrake": ("sim.drake",)
 DOORS |= {"pinocchio": ("sim.pinocchio",), "coal": ("sim.pinocchio",)}
 DOORS |= {"viser": ("report.view",), "trimesh": ("report.view",), "flax": ("grfm.nets",)}
 DOORS |= {"optax": ("grfm.nets", "tuning.difftune", "tuning.step_rules", "search.few_walks")}
-DOORS |= {"jaxopt": ("qp.jaxopt_solver",), "cmaes": ("search.",), "tinygp": ("search.few_walks",)}
+DOORS |= {"jaxopt": ("qp.jaxopt_solver",), "tinygp": ("search.few_walks",)}
 DOORS |= {
     "matplotlib": ("report.plots",),
     "jinja2": ("report.report", "export.source", "export.template"),
     "tyro": ("cli.parse",),
 }
-DOORS |= dict.fromkeys(("cma", "botorch", "torch"), ())
+DOORS |= dict.fromkeys(("cma", "cmaes", "botorch", "torch"), ())
 DOORS |= {"hector_jax.importing": ("importing.", "cli.commands")}  # robots of others
 
 

@@ -23,10 +23,8 @@ from hector_jax.core.inputs import InputError
 from hector_jax.grfm.network import save_net
 from hector_jax.robot.description import MODEL_PATH
 from hector_jax.robot.model import load_robot
-from hector_jax.store import nets, tunings
+from hector_jax.store import nets
 from hector_jax.store.nets import CollectConfig, TrainedNet
-from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.rollout import RolloutConfig
 
 
 def test_help_opens_with_what_is_typed_first_and_names_each_command_once():
@@ -74,7 +72,6 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
         ("tune --traj circle", "straight, c, s"),
         ("collect --seconds 0.001", "at least 0.03 s, the 3 ticks of one sample, got 0.001"),
         ("collect --walks 2", "--walks must be a whole number from 3 to"),
-        ("search --budget 9", "budget"),
     ],
 )
 def test_wrong_input_is_one_line_before_anything_is_computed(
@@ -165,30 +162,6 @@ def test_walks_are_collected_on_either_engine_and_a_net_is_trained_on_them(
 
 
 @pytest.mark.slow
-def test_a_search_leaves_weights_with_a_card_and_walks_nothing_twice(monkeypatch, capsys, tmp_path):
-    """Two generations of short walks on all trajectories; the second call finds all done."""
-    short = TuneConfig(rollout=RolloutConfig(ticks=20))
-    monkeypatch.setattr(tunings, "TuneConfig", lambda **settings: short)
-    flags = ("search", "--traj", "all", "--budget", "9", "--population", "4", "--engine", "c")
-    folders = ("--out", tmp_path / "found", "--record", tmp_path / "record", "--processes", "1")
-    assert call(monkeypatch, *flags, *folders) == 0
-    shown = capsys.readouterr().out
-    for name in ("straight", "c", "s"):
-        card = json.loads((tmp_path / "found" / f"{name}-card.json").read_text())
-        assert card["walks"] == 8
-        assert card["L"]["best"] == card["L"]["best_again"] > 0.0
-        assert f"{card['L']['start'] / 1e6:.3f}" in shown
-        weights = load_weights(tmp_path / "found" / f"{name}.json")
-        np.testing.assert_array_equal(weights.R.force[0], weights.R.force[1])
-        assert len((tmp_path / "record" / f"{name}.jsonl").read_text().splitlines()) == 3
-    kept = {path: path.read_bytes() for path in tmp_path.rglob("*.json*")}
-    assert call(monkeypatch, *flags, *folders) == 0
-    assert capsys.readouterr().out == shown
-    assert kept == {path: path.read_bytes() for path in tmp_path.rglob("*.json*")}
-    assert "choose another folder" in refused(monkeypatch, capsys, *flags, *folders, "--seed", "1")
-
-
-@pytest.mark.slow
 def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     """From nothing to a verdict, small: data, net, two tunings, judges, report."""
     monkeypatch.chdir(tmp_path)
@@ -264,7 +237,7 @@ def test_the_doctor_reports_what_works_and_what_does_not(monkeypatch, capsys):
     assert told["precision"] == "float64"
     assert told["robot"].startswith(str(MODEL_PATH))
     assert {"python", "jax", "mujoco", "devices", "cache", "extras", "video"} <= told.keys()
-    assert "search: yes (for hector search, tune --walks and propose)" in told["extras"]
+    assert "search: yes (for hector tune --walks and propose)" in told["extras"]
     assert call(monkeypatch, "doctor") == 0  # without --json the same lines
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(told)
 

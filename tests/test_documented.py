@@ -31,7 +31,6 @@ SMALL = {
     "verdict": "--seeds 1 --model-seeds 1 --engine-seeds 1",
     "collect": "--walks 3 --seconds 0.2 --engine c",
     "train": "--epochs 1",
-    "search": "--budget 5 --population 4 --engine c",
     "view": "--headless",
 }
 """Flags that make a line of a command small, in the place of its own."""
@@ -44,7 +43,7 @@ def words_of(line):
     """The words of a line as they are run here."""
     command, *words = shlex.split(line, comments=True)[1:]
     small = shlex.split(SMALL.get(command, ""))
-    for flag in {"--seeds", "--walks", "--budget", "--population", "--engine"} & {*small, *words}:
+    for flag in {"--seeds", "--walks", "--engine"} & {*small, *words}:
         if flag in small and flag in words:
             del words[words.index(flag) : words.index(flag) + 2]
     if command == "tune" and "--walker" in words:  # or as the run that is resumed
@@ -53,7 +52,7 @@ def words_of(line):
         small = []
     if command == "tune" and "--walks" in words:
         words[words.index("--walks") + 1] = "12" if "c" in words else "8"
-    if command in ("tune", "search") and not {"--traj", "--resume", "--config"} & {*words}:
+    if command == "tune" and not {"--traj", "--resume", "--config"} & {*words}:
         words += ["--traj", "straight"]
     files = command not in SECONDS or "runs/robot" in line  # that `hector propose` was given
     words = [one for word in words for one in found(word, files)]

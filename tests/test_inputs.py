@@ -32,7 +32,6 @@ from hector_jax.grfm.training import TrainConfig
 from hector_jax.qp import QpConfig
 from hector_jax.report.video import VideoConfig
 from hector_jax.robot.model import load_robot
-from hector_jax.search.cmaes import SearchConfig
 from hector_jax.store import collection
 from hector_jax.store.nets import CollectConfig
 from hector_jax.tuning.difftune import TuneConfig
@@ -66,7 +65,7 @@ def one_line(error):
 # Settings
 
 CONFIGS = (GaitConfig, FootstepConfig, LegConfig, QpConfig, MpcConfig, WalkConfig, VideoConfig)
-CONFIGS += (RolloutConfig, TuneConfig, SearchConfig, TrainConfig, CollectConfig, SceneConfig)
+CONFIGS += (RolloutConfig, TuneConfig, TrainConfig, CollectConfig, SceneConfig)
 SIGNED = {"LegConfig.landing", "FootstepConfig.feedback", "FootstepConfig.turn"}
 
 

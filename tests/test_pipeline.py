@@ -1,4 +1,4 @@
-"""A net is reused only for its own walks and controller; a loss is one number on either engine."""
+"""A net is reused only for its own walks and controller; a tuning has its scale, and its depth."""
 
 import traceback
 from concurrent.futures import ThreadPoolExecutor
@@ -14,9 +14,8 @@ from test_walks import HandsOver
 
 from hector_jax.cli import tune
 from hector_jax.control import mpc
-from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
-from hector_jax.control.weights import expert, nominal
+from hector_jax.control.weights import nominal
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.grfm import dataset
@@ -24,19 +23,12 @@ from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import load_robot
 from hector_jax.search.few_walks import space_of
-from hector_jax.sim.engine import ENGINES
-from hector_jax.sim.loop import Job
-from hector_jax.sim.walk import walk
-from hector_jax.sim.world import hfs
 from hector_jax.store import nets, tunings
 from hector_jax.store.collection import collect
 from hector_jax.store.nets import CollectConfig
 from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
-from hector_jax.tuning.rollout import RolloutConfig
-from hector_jax.verdict.metrics import score
-from hector_jax.walk_tuning import searches
 
 ROBOT = load_robot()
 ONCE = TrainConfig("linear")  # the command's variant here: its fit takes no time
@@ -157,21 +149,3 @@ def test_from_the_command_to_the_qp_the_stack_has_14_frames(monkeypatch, tmp_pat
     flags = ("--traj", trajectory, "--start", start, "--out", tmp_path / "run")
     assert call(monkeypatch, "tune", *flags) == 2
     assert len(frames) + 1 == 14  # with that of `solve_qp`
-
-
-@pytest.mark.slow
-def test_what_a_search_is_told_is_the_loss_of_the_verdict_on_either_engine():
-    config = TuneConfig(rollout=RolloutConfig(ticks=4))
-    sets = {"c": [nominal(), expert()], "s": [nominal()]}
-    commands = {name: named_command(name) for name in sets}
-    setup = Setup(ThreadPoolExecutor(1), config, ROBOT)
-    options = {"commands": commands, "at_once": 3}
-    c, mjx = (
-        searches.losses_on_hfs(setup, sets, engine=ENGINES[name], **options)
-        for name in ("c", "mjx")
-    )
-    for name, each in sets.items():
-        jobs = [Job(weights, commands[name], hfs(), 0.04) for weights in each]
-        scores = [score(config.loss, walk(WalkConfig(), ROBOT, job)).L for job in jobs]
-        np.testing.assert_allclose(c[name], scores, rtol=1e-12)
-        np.testing.assert_allclose(mjx[name], c[name], rtol=1e-4)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hector_jax.cli.flags import Check, Collect, Evaluate, Search, Train, Tune, Verdict, View, Walk
+from hector_jax.cli.flags import Check, Collect, Evaluate, Train, Tune, Verdict, View, Walk
 from hector_jax.control import trajectories
 from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import gait_named
@@ -134,7 +134,7 @@ def robot_of_run(run: Path, request: RunRequest) -> Robot:
     return robot
 
 
-def flag_folder(args: Collect | Train | Search, name: str, robot: Robot) -> Path:
+def flag_folder(args: Collect | Train, name: str, robot: Robot) -> Path:
     """Return the folder of a flag; for another robot its default DATA/... is DATA/NAME/..."""
     folder = getattr(args, name)
     if args.is_given(name):

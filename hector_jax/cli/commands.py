@@ -10,14 +10,12 @@ from hector_jax.cli import arguments, doctor, evaluate, flags, propose, tune, ve
 from hector_jax.cli.arguments import print_result
 from hector_jax.control.controller import walk_config
 from hector_jax.control.twin import TwinConfig
-from hector_jax.control.weights import expert, nominal
-from hector_jax.control.weights_file import save_weights
+from hector_jax.control.weights import nominal
 from hector_jax.core.console import say
-from hector_jax.core.environment import versions
 from hector_jax.core.files import locked, write_file, write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
-from hector_jax.core.settings import as_toml, to_table
+from hector_jax.core.settings import as_toml
 from hector_jax.export import export
 from hector_jax.export.template import fill_template
 from hector_jax.grfm.training import TrainConfig
@@ -26,14 +24,10 @@ from hector_jax.importing.remarks import differences, remarks
 from hector_jax.importing.table import changes_of_model, section, table_of
 from hector_jax.report.compare import compare_runs, print_comparison
 from hector_jax.robot.model import load_robot
-from hector_jax.search.cmaes import SearchConfig
 from hector_jax.sim import margin
-from hector_jax.sim.engine import choose_engine
-from hector_jax.store import nets, tunings
+from hector_jax.store import nets
 from hector_jax.store.folder import RESULT, load_run, read_request
-from hector_jax.store.setup import Setup
-from hector_jax.tuning.loss import alphas, loss_of_robot
-from hector_jax.walk_tuning import searches
+from hector_jax.tuning.loss import loss_of_robot
 
 
 @singledispatch
@@ -87,55 +81,6 @@ def run_train(args: flags.Train) -> None:
     result = {"net": str(path), "errors": errors}
     print_result(args.json, result, partial(arguments.print_errors, errors))
     say(f"the net is in {path}")
-
-
-@run.register
-def run_search(args: flags.Search) -> None:
-    """Search for weights on the simulator, without gradients."""
-    robot = load_robot(args.robot)
-    trajectories = arguments.load_trajectories([args.traj], robot)
-    commands = {trajectory.name: trajectory.command for trajectory in trajectories}
-    config = SearchConfig(args.budget, args.population, args.seed, args.spread)
-    engine = choose_engine(args.engine)
-    tuning = arguments.with_length(tunings.tune_config(robot), trajectories[0])
-    start = arguments.weights_by_name(args.start, robot)
-    out = arguments.flag_folder(args, "out", robot)
-    shared: dict[str, Any] = {"commands": commands, "engine": engine}
-    with locked(out), workers(args.processes, args.cluster) as pool:
-        setup = Setup(pool, tuning, robot)
-        results = searches.search_all(setup, config, start, folder=args.record or out, **shared)
-        say("walking with the start, expert and best weights")
-        sets = {name: [start, expert(robot), result.weights] for name, result in results.items()}
-        at_once = config.population * len(commands)
-        losses = searches.losses_on_hfs(setup, sets, at_once=at_once, **shared)
-        cards = {}
-        for name, result in results.items():
-            walked = zip(("start", "expert", "best_again"), losses[name].tolist(), strict=True)
-            cards[name] = {
-                "trajectory": name,
-                "L": {"best": result.loss, **dict(walked)},
-                "walks": len(result.history) * config.population,
-                "best_at": result.walk,
-                "stop": result.stop,
-                "search": to_table(config),
-                "start": args.start,
-                "engine": engine.name,
-                "rollout": to_table(tuning.rollout),
-                "loss": alphas(tuning.loss),
-                "versions": versions(),
-            }
-            save_weights(out / f"{name}.json", result.weights)
-            write_json(out / f"{name}-card.json", cards[name])
-    print_result(args.json, {"weights": str(out), "cards": cards}, partial(_print_search, cards))
-    say(f"the weights are in {out}")
-
-
-def _print_search(cards: Mapping[str, Mapping[str, Any]]) -> None:
-    print("L in 1e6 on the high-fidelity simulator")
-    print(f"{'':10s}{'start':>9s}{'best':>9s}{'expert':>9s}{'walks':>8s}{'best at':>9s}")
-    for name, card in cards.items():
-        losses = "".join(f"{card['L'][x] / 1e6:9.3f}" for x in ("start", "best", "expert"))
-        print(f"{name:10s}{losses}{card['walks']:8d}{card['best_at']:9d}")
 
 
 @run.register

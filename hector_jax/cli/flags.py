@@ -233,24 +233,6 @@ class Report(Parallel, Printed):
 
 
 @_command
-class Search(Configured, ForRobot, Parallel, Printed):
-    """Search for weights on the high-fidelity simulator without derivatives (CMA-ES).
-
-    Example: hector search --traj s --budget 400
-    """
-
-    traj: Trajectory = "straight"  # straight, c, s, all or a TOML file
-    budget: Annotated[int, Range(1, 1_000_000)] = 200  # most walks per trajectory
-    population: Annotated[int, Range(4, 10_000)] = 10  # walks in a generation
-    seed: Seed = 0  # seed of the search
-    spread: Annotated[float, Range(0, 10, above=True)] = 1.0  # initial deviation of log-weights
-    start: Weights = "nominal"  # nominal, expert, best or a weights file
-    engine: Engine = "auto"  # c: MuJoCo, one walk per process; mjx: all at once; auto: mjx on a GPU
-    out: Folder = Path("runs/search")  # folder for the best weights, each with a card
-    record: Path | None = None  # folder of the record that a search resumes from; by default OUT
-
-
-@_command
 class Evaluate(Configured, ForRobot, ByWalker, Parallel, Printed):
     """Evaluate weight sets on the plants of a world and print a table.
 

@@ -46,7 +46,6 @@ OVERVIEW = {
         "collect": "walk on the simulator and record the ground forces",
         "train": "train GRFM-Net, the model of the ground, on these walks",
         "grfm": "how well that net predicts walks that it never saw",
-        "search": "search for weights on the simulator, without derivatives",
     },
     "This machine": {"doctor": "versions, devices, cache and video, with a test"},
 }

@@ -34,6 +34,7 @@ from hector_jax.control.weights import (
     weights_to_vector,
 )
 from hector_jax.core.arrays import Array
+from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import Range
 from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import Robot
@@ -218,6 +219,22 @@ def step_bounds(
     """Return the lower and upper bounds of the steps that stay in the box, see `stepped`."""
     lower, upper = (steps_between(start, edge, others) for edge in bounds(others, start))
     return lower, upper
+
+
+def checked_bounds(start: Weights, others: Sequence[str] = ()) -> Float[np.ndarray, "n 2"]:
+    """Return the `step_bounds` from a start in the box, as two columns.
+
+    Raises:
+        InputError: the start lies outside the box, or its feet differ.
+    """
+    trees = (start, *bounds(like=start))
+    at, low, high = (np.asarray(weights_to_vector(w), float) for w in trees)
+    if any(np.any(part != part[:1]) for part in start.R):
+        raise InputError("a search needs a start whose feet share one R; these differ")
+    if not ((low <= at) & (at <= high)).all():
+        box = ", ".join(f"{n} {x.lower:g} to {x.upper:g}" for n, x in {"Q": Q, "R": R}.items())
+        raise InputError(f"the start lies outside the box of weights: {box}")
+    return np.stack(step_bounds(start, others), axis=1)
 
 
 def weights_after(

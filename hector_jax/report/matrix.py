@@ -17,7 +17,7 @@ from hector_jax.verdict.matrix import OWN, Cells, Column
 from hector_jax.verdict.metrics import BASELINES, FEWEST, Interval, compare
 
 TITLES = {name: engine.title for name, engine in ENGINES.items()}
-LEARNED_FROM = ("c", "mjx")  # engines whose walks train the nets and serve the searches
+LEARNED_FROM = ("c", "mjx")  # engines whose walks train the nets and tune weights
 
 
 def title_of(column: Column) -> str:

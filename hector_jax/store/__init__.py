@@ -2,5 +2,5 @@
 
 `cache` keeps a result under a key of all that it depends on; `tunings`, `collection` and `nets` are
 the steps that a run keeps in this way; `folder` has the files of a run; `setup` is what its steps
-share. What grows row by row, as searches and walks do, is a `core.journal`.
+share. What grows row by row, as tunings and walks do, is a `core.journal`.
 """

@@ -21,7 +21,6 @@ from hector_jax.control.weights import Weights, direction_names
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import choose
 from hector_jax.robot.model import Robot
-from hector_jax.search.cmaes import checked_bounds
 from hector_jax.search.few_walks import Space
 from hector_jax.sim.engine import MUJOCO_C, Engine
 from hector_jax.sim.world import Imperfections
@@ -99,7 +98,7 @@ def with_leg_numbers(walk: WalkConfig, start: Weights, names: Sequence[str]) -> 
 
 def box_of(campaign: Campaign) -> Float[np.ndarray, "n 2"]:
     """Return bounds of the steps: of log-weights, and of other numbers in their units."""
-    return checked_bounds(campaign.start, campaign.numbers) / _units(campaign)[:, None]
+    return parameters.checked_bounds(campaign.start, campaign.numbers) / _units(campaign)[:, None]
 
 
 def _units(campaign: Campaign) -> Float[np.ndarray, " n"]:

@@ -1,0 +1,73 @@
+"""CMA-ES as the experiments use it, on a bowl in the place of walks."""
+
+from dataclasses import replace
+from functools import partial
+
+import many_plants
+import numpy as np
+import pytest
+from rivals import RIVALS, Spent, Task
+
+from hector_jax.control.reference import named_command
+from hector_jax.control.weights import nominal
+from hector_jax.core.inputs import InputError
+from hector_jax.robot.model import load_robot
+from hector_jax.search.few_walks import Space
+from hector_jax.sim.engine import MUJOCO_C
+from hector_jax.sim.world import hfs
+from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.walk_tuning.campaign import Campaign, box_of
+
+BOX = np.array([[-3.0, 1.0]] * 6)
+GOAL = np.linspace(-2.0, 2.0, 6)  # partly beyond the box
+
+
+def test_cma_es_goes_downhill_inside_the_box():
+    points = []
+
+    def walk(point):
+        if len(points) == 600:
+            raise Spent
+        points.append(point)
+        return np.sum((point - GOAL) ** 2)
+
+    nothing = np.zeros((0, 6)), np.zeros(0)
+    with pytest.raises(Spent):
+        RIVALS["cma-es"](Task(walk, BOX, 1.0, 3, nothing))
+    seen = np.array(points)
+    assert ((BOX[:, 0] <= seen) & (seen <= BOX[:, 1])).all()
+    np.testing.assert_allclose(seen[-1], np.clip(GOAL, *BOX.T), atol=0.1)
+
+
+def test_a_search_over_plants_that_was_cut_ends_as_if_it_had_not_been(monkeypatch, tmp_path):
+    robot, walked = load_robot(), []
+    inputs = tmp_path, TuneConfig(), robot, nominal(robot), {"s": named_command("s")}, [hfs()]
+    campaign = Campaign(*inputs)
+
+    def losses_of(pool, campaign, engine, sets, batch):
+        walked.append(len(sets))
+        for weights in sets:
+            loss = 1.0 + np.log(weights.Q.euler[0] / campaign.start.Q.euler[0] / 2.0) ** 2
+            yield np.array([loss if loss < 1.6 else np.inf])  # a QP that was not solved
+
+    box = box_of(campaign)
+    space = Space(np.eye(len(box)), np.eye(len(box)), np.ones(len(box)), box)
+    monkeypatch.setattr(many_plants, "losses_of", losses_of)
+    monkeypatch.setattr(many_plants, "campaign_space", lambda *_: space)
+    flags = many_plants.Flags(generations=12, population=8)
+    search = partial(many_plants.search, None, campaign, MUJOCO_C)
+    whole, path = search(flags), tmp_path / "generations.jsonl"
+    assert walked == [1, *[8] * 12]  # the start, then the generations
+    assert whole.Q.euler[0] > 1.2 * campaign.start.Q.euler[0]
+    lines = path.read_bytes().splitlines(keepends=True)
+    assert b"null" in b"".join(lines)
+    path.write_bytes(b"".join(lines[:9]) + lines[9][:50])
+    walked.clear()
+    np.testing.assert_array_equal(search(flags).Q.euler, whole.Q.euler)
+    assert walked == [1, *[8] * 4]
+    assert path.read_bytes() == b"".join(lines)
+    path.write_bytes(b"".join([*lines[:2], b'{"steps": [[0]], "losses": [1]}\n']))
+    for other, told in ((flags, "line 3"), (replace(flags, seed=5), "made with seed 0")):
+        walked.clear()  # the record knows its functions with all that they hold
+        with pytest.raises(InputError, match=told):
+            search(other)
