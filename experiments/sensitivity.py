@@ -17,8 +17,7 @@ from hector_jax.control.parameters import step_names, stepped
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench
-from hector_jax.tuning.curvature import matrix_of_walk
-from hector_jax.tuning.loss import Loss, losses, total
+from hector_jax.tuning.loss import Loss, losses, residuals, total
 from hector_jax.tuning.rollout import (
     Carry,
     RolloutConfig,
@@ -128,6 +127,11 @@ def matrix(
     def moved(steps: Float[jax.Array, " m"]) -> Float[jax.Array, " n"]:
         return ravel_pytree(stepped(weights, steps, others))[0]
 
+    def rows(state: State, command: Wrench) -> Float[jax.Array, " rows"]:
+        return residuals(loss, trajectory._replace(state=state, command=command))
+
     by_steps = jax.jacobian(moved)(jnp.zeros(len(step_names(weights, others))))
-    tangents = sensitivities.state, sensitivities.command
-    return by_steps.T @ matrix_of_walk(loss, trajectory, tangents) @ by_steps
+    at = trajectory.state, trajectory.command
+    along = jax.vmap(lambda *tangent: jax.jvp(rows, at, tangent)[1])
+    J = along(sensitivities.state, sensitivities.command).T @ by_steps
+    return 2.0 * J.T @ J

@@ -4,7 +4,6 @@ from dataclasses import replace
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from model import ANCHOR, ROBOT
@@ -21,13 +20,14 @@ from hector_jax.tuning.difftune import TuneConfig, tune
 from hector_jax.tuning.loss import (
     PAPER_LOSS,
     LossTerm,
-    between_loss,
+    changes_between,
     loss_of_robot,
     losses,
+    residuals,
     switch_loss,
     total,
 )
-from hector_jax.tuning.rollout import RolloutConfig, Scenario
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.verdict import metrics
 
 parts_of, switches_of = jax.jit(partial(losses, PAPER_LOSS)), jax.jit(switch_loss)
@@ -112,23 +112,26 @@ def test_control_counts_each_change_once_and_those_at_changes_of_stance_are_its_
     contact[4:, 0] = False
     trajectory = trajectory._replace(command=Wrench(force, moment), contact=contact)
     assert switches_of(trajectory) == pytest.approx(60.0**2)
-    assert float(jax.jit(between_loss)(trajectory)) == pytest.approx(25.0 + 16.0 + 4.0)
+    assert np.sum(changes_between(trajectory) ** 2) == pytest.approx(25.0 + 16.0 + 4.0)
     assert parts_of(trajectory)["L_ctrl"] == pytest.approx(60.0**2 + 45.0)
 
 
-def sway_loss(trajectory):
-    """A term of one's own: squared sideways velocity."""
-    return jnp.sum(trajectory.state.velocity[:, 1] ** 2)
+def sway(trajectory):
+    """A term of one's own: sideways velocity."""
+    return trajectory.state.velocity[:, 1]
 
 
 def test_a_fourth_term_is_tuned_told_and_written_from_one_place():
-    loss = (*PAPER_LOSS, LossTerm("L_sway", "m^2/s^2", 1e4, sway_loss))
+    loss = (*PAPER_LOSS, LossTerm("L_sway", "m^2/s^2", 1e4, sway))
     config = TuneConfig(rollout=RolloutConfig(ticks=20), loss=loss, iterations=1)
-    tuning = tune(config, Scenario(ROBOT, named_command("s"), ANCHOR, last_command), nominal())
+    scenario = Scenario(ROBOT, named_command("s"), ANCHOR, last_command)
+    tuning = tune(config, scenario, nominal())
     first = tuning.iterations[0]
     terms = first.evaluation.terms
     assert terms["L_sway"] > 0.0
     assert first.evaluation.loss == pytest.approx(float(total(loss, terms)))
+    walked = rollout(config.rollout, scenario, nominal())
+    assert first.evaluation.loss == pytest.approx(float(np.sum(residuals(loss, walked) ** 2)))
     assert as_row("mine", first)["L_sway"] == pytest.approx(float(terms["L_sway"]))
     walks = [metrics.score(loss, pretend_walk())] * 2
     verdict = metrics.make_verdict(loss, [0, 1], {"s": {"nominal": walks, "mine": walks}})
@@ -156,6 +159,6 @@ def test_a_robot_that_is_elsewhere_can_still_go_as_fast_as_it_should():
 
 
 def test_terms_that_cannot_be_told_apart_are_refused():
-    for loss in ((*PAPER_LOSS, PAPER_LOSS[0]), (LossTerm("sway", "", 1.0, sway_loss),)):
+    for loss in ((*PAPER_LOSS, PAPER_LOSS[0]), (LossTerm("sway", "", 1.0, sway),)):
         with pytest.raises(InputError, match="unlike names"):
             TuneConfig(loss=loss)

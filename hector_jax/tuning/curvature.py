@@ -1,8 +1,8 @@
 """Directions of the weights that matter: eigenvectors of the loss's Gauss-Newton matrix.
 
-The loss is nearly quadratic in a walk, so along a step s in the log-weights it is curved by
-s' H s with H = J' (d2L / dw2) J, where w are the states and commands of the walk and J is their
-derivative. A direction of H with a small eigenvalue changes neither walk nor loss.
+The loss is a sum of squares of residuals, so along a step s in the log-weights it is curved by
+s' H s with H = 2 J' J, where J is the derivative of the residuals. A direction of H with a small
+eigenvalue changes neither walk nor loss.
 """
 
 from collections.abc import Sequence
@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.control.parameters import step_names, stepped
+from hector_jax.control.parameters import stepped, steps_between
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
-from hector_jax.core.trajectory import State, Trajectory, Wrench
+from hector_jax.core.trajectory import Trajectory
 from hector_jax.tuning.evaluate import Walk
-from hector_jax.tuning.loss import Loss, losses, total
+from hector_jax.tuning.loss import Loss, residuals
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
 _NAMED = 0.35  # a direction is named by the weights of at least this share of its largest entry
@@ -56,7 +56,17 @@ class Determined(NamedTuple):
         return [name for name, share in self.weights.items() if share < 0.5]
 
 
-def gauss_newton(
+class Linearised(NamedTuple):
+    """The loss of a walk on the model, as a sum of squares to first order in the steps."""
+
+    loss: Float[Array, "*batch"]
+    gradient: Float[Array, "*batch n"]
+    matrix: Float[Array, "*batch n n"]  # Gauss-Newton
+    fallen: Float[Array, "*batch"]  # share of the ticks after a fall
+    residual: Float[Array, "*batch"]  # largest of a QP
+
+
+def linearise(
     config: RolloutConfig,
     scenario: Any,
     weights: Weights,
@@ -64,8 +74,10 @@ def gauss_newton(
     *,
     walk: Walk = rollout,
     others: tuple[str, ...] = (),
-) -> Float[Array, "n n"]:
-    """Compute the Gauss-Newton matrix of the loss of a rollout.
+) -> Linearised:
+    """Compute loss, gradient and Gauss-Newton matrix of a rollout, in forward mode.
+
+    With the residuals r and their derivative J these are r'r, 2 J'r and 2 J'J.
 
     Args:
         config, scenario, walk: of the rollout, see `evaluate`.
@@ -74,48 +86,34 @@ def gauss_newton(
         others: names of numbers beside Q and R.
 
     Returns:
-        The matrix in the n coordinates of `parameters.stepped`.
+        Gradient and matrix in the n coordinates of `parameters.stepped`.
     """
-    zero = jnp.zeros(len(step_names(weights, others)))
+    zero = jnp.zeros(len(steps_between(weights, weights, others)))
 
-    def moved(steps: Float[Array, " n"]) -> tuple[tuple[State, Wrench], Trajectory]:
+    def moved(steps: Float[Array, " n"]) -> tuple[Float[Array, " rows"], Trajectory]:
         trajectory = walk(config, scenario, stepped(weights, steps, others))
-        return (trajectory.state, trajectory.command), trajectory
+        return residuals(loss, trajectory), trajectory
 
     def tangent_of(direction: Float[Array, " n"]) -> tuple:
         return jax.jvp(moved, (zero,), (direction,), has_aux=True)
 
-    _, tangents, trajectory = jax.vmap(tangent_of, out_axes=(None, 0, None))(jnp.eye(len(zero)))
-    return matrix_of_walk(loss, trajectory, tangents)
+    rows, J, trajectory = jax.vmap(tangent_of, out_axes=(None, 0, None))(jnp.eye(len(zero)))
+    fallen, residual = jnp.mean(1.0 * trajectory.fallen), jnp.max(trajectory.residual)
+    return Linearised(rows @ rows, 2.0 * J @ rows, 2.0 * J @ J.T, fallen, residual)
 
 
-gauss_newton_jit = jax.jit(gauss_newton, static_argnums=0, static_argnames=("walk", "others"))
-"""`gauss_newton`, compiled once per rollout and set of terms."""
-
-
-def matrix_of_walk(
-    loss: Loss, trajectory: Trajectory, tangents: tuple[State, Wrench]
+def gauss_newton(
+    config: RolloutConfig, scenario: Any, weights: Weights, loss: Loss, **options: Any
 ) -> Float[Array, "n n"]:
-    """Return the Gauss-Newton matrix from the tangents of the walk's states and commands.
+    """Return the matrix of `linearise`."""
+    return linearise(config, scenario, weights, loss, **options).matrix
 
-    Args:
-        loss: terms and their weights.
-        trajectory: the walk.
-        tangents: of `state` and `command` of the walk, with the coordinate as first axis.
-    """
 
-    def objective(point: tuple[State, Wrench]) -> Float[Array, ""]:
-        state, command = point
-        return total(loss, losses(loss, trajectory._replace(state=state, command=command)))
-
-    gradient, point = jax.grad(objective), (trajectory.state, trajectory.command)
-    products = jax.vmap(lambda tangent: jax.jvp(gradient, (point,), (tangent,))[1])(tangents)
-    count = len(jax.tree.leaves(tangents)[0])
-    rows, columns = (
-        jnp.concatenate([x.reshape(count, -1) for x in jax.tree.leaves(tree)], axis=1)
-        for tree in (tangents, products)
-    )
-    return rows @ columns.T
+linearise_jit, gauss_newton_jit = (
+    jax.jit(function, static_argnums=0, static_argnames=("walk", "others"))
+    for function in (linearise, gauss_newton)
+)
+"""`linearise` and `gauss_newton`, compiled once per rollout and set of terms."""
 
 
 def determined(

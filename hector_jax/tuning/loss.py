@@ -2,11 +2,10 @@
 
     L = alpha_1 sum |e - e_ref|^2 + alpha_2 sum |p - p_ref|^2 + sum |u_j - u_{j-1}|^2
 
-over 1 kHz samples. A loss is a tuple of terms, each a function of a trajectory with a weight alpha;
-`PAPER_LOSS` has the three of the paper, and the commands use it with the robot's own weights. A
-term that is added to it appears in gradients, logs, tables and files by its name; functions in
-Python take any such tuple (docs/howto/loss.md). The forward recursion, and with it
-tuning along measured walks, differentiates a term by the states and commands of a walk only.
+over 1 kHz samples. A loss is a tuple of terms, each a weight alpha and the residuals of a walk
+whose squares are summed; `PAPER_LOSS` has the three of the paper, and the commands use it with the
+robot's own weights. A term that is added to it appears in gradients, logs, tables and files by its
+name; functions in Python take any such tuple (docs/howto/loss.md).
 
 A world with longer ticks multiplies its tracking sums by the milliseconds of a tick; the smoothness
 term sums the changes of the held command. After a fall every missing sample counts the larger of
@@ -31,7 +30,7 @@ from hector_jax.core.geometry import rot_z
 from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError, short_repr, unknown
 from hector_jax.core.settings import NOT_NEGATIVE, convert
-from hector_jax.core.trajectory import State, Trajectory, Wrench
+from hector_jax.core.trajectory import State, Trajectory
 from hector_jax.robot.description import Description
 
 SAMPLE = 1e-3  # [s] period of the paper's sums
@@ -50,7 +49,8 @@ class LossTerm(NamedTuple):
     name: str  # "L_Eul": in tables, logs and files; begins with L_
     unit: str  # "rad^2"
     weight: float  # alpha; an array in a batch
-    of: Callable[[Trajectory], Float[Array, ""]]  # the unweighted term of one walk
+    # residuals of one walk, of any shape: the unweighted term is the sum of their squares
+    of: Callable[[Trajectory], Float[Array, "..."]]
 
     def __repr__(self) -> str:
         # identifies it in keys of stored results
@@ -71,43 +71,49 @@ Terms = Mapping[str, Float[Array, "*batch"]]
 """Values of the terms of a loss, by name."""
 
 
-def _tracking_loss(
+def _tracking(
     trajectory: Trajectory, error: Float[Array, "T 3"], minimum: float | Float[Array, " T"]
-) -> Float[Array, ""]:
-    """Sum a squared error over 1 kHz samples; after a fall it is the last, at least a minimum."""
-    fallen, squares = trajectory.fallen, jnp.sum(error**2, axis=-1)
-    before = jnp.where(fallen, 0.0, squares)
+) -> Float[Array, "T 3"]:
+    """Return an error for sums over 1 kHz samples; after a fall the last, at least a minimum."""
+    fallen = trajectory.fallen
     last = jnp.maximum(jnp.sum(~fallen) - 1, 0)
-    charged = jnp.where(fallen, jnp.maximum(before[last], minimum**2), before)
-    return trajectory.period / SAMPLE * jnp.sum(charged)
+    square = jnp.sum(jnp.where(fallen[last], 0.0, error[last]) ** 2)
+    charged = jnp.sqrt(jnp.maximum(square, minimum**2)) * jnp.ones(len(fallen))
+    after = charged[:, None] * jnp.array([1.0, 0.0, 0.0])
+    return jnp.sqrt(trajectory.period / SAMPLE) * jnp.where(fallen[:, None], after, error)
 
 
-def _squared_changes(command: Wrench, fallen: Bool[Array, " T"]) -> Float[Array, " T-1"]:
-    change = jnp.sum(jnp.diff(command.force, axis=0) ** 2, axis=(1, 2))
-    change = change + jnp.sum(jnp.diff(command.moment, axis=0) ** 2, axis=(1, 2))
-    return jnp.where(fallen[1:], 0.0, change)
-
-
-def euler_loss(trajectory: Trajectory) -> Float[Array, ""]:
-    """Sum the squared error of roll, pitch and yaw [rad^2] over 1 kHz samples."""
+def euler_error(trajectory: Trajectory) -> Float[Array, "T 3"]:
+    """Return the error of roll, pitch and yaw [rad] for sums over 1 kHz samples."""
     error = trajectory.state.euler - trajectory.reference.euler
-    return _tracking_loss(trajectory, error, FALL_EULER)
+    return _tracking(trajectory, error, FALL_EULER)
 
 
-def position_loss(trajectory: Trajectory) -> Float[Array, ""]:
-    """Sum the squared error of the centre of mass [m^2] over 1 kHz samples."""
+def position_error(trajectory: Trajectory) -> Float[Array, "T 3"]:
+    """Return the error of the centre of mass [m] for sums over 1 kHz samples."""
     error = trajectory.state.position - trajectory.reference.position
     minimum = jnp.maximum(trajectory.reference.position[..., 2], FALL_POSITION)
-    return _tracking_loss(trajectory, error, minimum)
+    return _tracking(trajectory, error, minimum)
 
 
-def control_loss(trajectory: Trajectory) -> Float[Array, ""]:
-    """Sum the squared changes of the commanded wrench [N^2 and (N m)^2] over a walk."""
-    return jnp.sum(_squared_changes(trajectory.command, trajectory.fallen))
+def command_changes(trajectory: Trajectory) -> Float[Array, "T-1 feet 6"]:
+    """Return the changes of the commanded wrench [N and N m]; none after a fall."""
+    changes = jnp.diff(jnp.concatenate(trajectory.command, axis=-1), axis=0)
+    return jnp.where(trajectory.fallen[1:, None, None], 0.0, changes)
 
 
-def velocity_loss(trajectory: Trajectory) -> Float[Array, ""]:
-    """Sum the squared error of the velocity ahead and aside [m^2/s^2] over 1 kHz samples.
+def _switched(trajectory: Trajectory) -> Bool[Array, "T-1 1 1"]:
+    contact = trajectory.contact
+    return jnp.any(contact[1:] != contact[:-1], axis=-1)[:, None, None]
+
+
+def changes_between(trajectory: Trajectory) -> Float[Array, "T-1 feet 6"]:
+    """Return the changes of the command between switches of stance."""
+    return jnp.where(_switched(trajectory), 0.0, command_changes(trajectory))
+
+
+def velocity_error(trajectory: Trajectory) -> Float[Array, "T 3"]:
+    """Return the error of the velocity ahead and aside [m/s] for sums over 1 kHz samples.
 
     Each velocity is seen along its own yaw, so that it does not matter where the robot is.
     """
@@ -116,25 +122,25 @@ def velocity_loss(trajectory: Trajectory) -> Float[Array, ""]:
         return jnp.einsum("tji,tj->ti", jax.vmap(rot_z)(state.euler[:, 2]), state.velocity)
 
     error = along_yaw(trajectory.state) - along_yaw(trajectory.reference)
-    return _tracking_loss(trajectory, error * jnp.array([1.0, 1.0, 0.0]), FALL_VELOCITY)
+    return _tracking(trajectory, error * jnp.array([1.0, 1.0, 0.0]), FALL_VELOCITY)
 
 
-def yaw_rate_loss(trajectory: Trajectory) -> Float[Array, ""]:
-    """Sum the squared error of the yaw rate [rad^2/s^2] over 1 kHz samples."""
+def yaw_rate_error(trajectory: Trajectory) -> Float[Array, "T 3"]:
+    """Return the error of the yaw rate [rad/s] for sums over 1 kHz samples."""
     error = trajectory.state.ang_velocity - trajectory.reference.ang_velocity
-    return _tracking_loss(trajectory, error * jnp.array([0.0, 0.0, 1.0]), FALL_RATE)
+    return _tracking(trajectory, error * jnp.array([0.0, 0.0, 1.0]), FALL_RATE)
 
 
 PAPER_LOSS: Loss = (
-    LossTerm("L_Eul", "rad^2", 1e5, euler_loss),
-    LossTerm("L_pos", "m^2", 2e5, position_loss),
-    LossTerm("L_ctrl", "N^2, (N m)^2", 1.0, control_loss),
+    LossTerm("L_Eul", "rad^2", 1e5, euler_error),
+    LossTerm("L_pos", "m^2", 2e5, position_error),
+    LossTerm("L_ctrl", "N^2, (N m)^2", 1.0, command_changes),
 )
 """The loss of the paper. Source: Eq. 11."""
 
 OPTIONAL_TERMS: Loss = (
-    LossTerm("L_vel", "m^2/s^2", 0.0, velocity_loss),
-    LossTerm("L_yaw_rate", "rad^2/s^2", 0.0, yaw_rate_loss),
+    LossTerm("L_vel", "m^2/s^2", 0.0, velocity_error),
+    LossTerm("L_yaw_rate", "rad^2/s^2", 0.0, yaw_rate_error),
 )
 """Terms that a robot's description may add, for a controller whose reference starts at the robot in
 each plan: it cannot know where it should be, but how fast."""
@@ -143,14 +149,20 @@ each plan: it cannot know where it should be, but how fast."""
 def losses(loss: Loss, trajectory: Trajectory) -> Terms:
     """Compute the unweighted terms of the loss of a walk. Source: Eq. 11."""
     trajectory = jax.tree.map(jnp.asarray, trajectory)  # the simulators return NumPy arrays
-    return {term.name: term.of(trajectory) for term in loss}
+    return {term.name: jnp.sum(term.of(trajectory) ** 2) for term in loss}
+
+
+def residuals(loss: Loss, trajectory: Trajectory) -> Float[Array, " rows"]:
+    """Return the residuals of a walk, whose squares sum to its loss."""
+    rows = [jnp.sqrt(term.weight) * jnp.ravel(term.of(trajectory)) for term in loss]
+    return jnp.concatenate(rows)
 
 
 def switch_loss(trajectory: Trajectory) -> Float[Array, ""]:
     """Compute the part of L_ctrl at changes of stance: about 2 (m g)^2 each for all weights."""
     trajectory = jax.tree.map(jnp.asarray, trajectory)
-    switched = jnp.any(trajectory.contact[1:] != trajectory.contact[:-1], axis=-1)
-    return jnp.sum(jnp.where(switched, _squared_changes(trajectory.command, trajectory.fallen), 0))
+    changes = jnp.where(_switched(trajectory), command_changes(trajectory), 0.0)
+    return jnp.sum(changes**2)
 
 
 def total(loss: Loss, terms: Mapping[str, Any]) -> Float[Array, "*batch"]:
@@ -218,11 +230,6 @@ def with_alphas(weights: Mapping[str, Any], loss: Loss = PAPER_LOSS) -> Loss:
     return weighted
 
 
-def between_loss(trajectory: Trajectory) -> Float[Array, ""]:
-    """Sum the squared changes of the command between switches of stance: L_ctrl without those."""
-    return control_loss(trajectory) - switch_loss(trajectory)
-
-
 def smoother(loss: Loss, price: float) -> Loss:
     """Return a loss to which changes of the command between switches of stance are added.
 
@@ -230,7 +237,7 @@ def smoother(loss: Loss, price: float) -> Loss:
     stays as it is.
     """
     added = (
-        LossTerm("L_between", term.unit, price * term.weight, between_loss)
+        LossTerm("L_between", term.unit, price * term.weight, changes_between)
         for term in loss
         if price and term.name == "L_ctrl"
     )
