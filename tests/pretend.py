@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from hector_jax.cli.main import main
 from hector_jax.control.weights import nominal
-from hector_jax.core.trajectory import State, Trajectory, Wrench
+from hector_jax.core.trajectory import State, Trajectory, Wrench, no_samples
 from hector_jax.core.tree import stack
 from hector_jax.tuning.difftune import Iteration, Tuning
 from hector_jax.tuning.evaluate import Evaluation
@@ -42,6 +42,11 @@ def refused(monkeypatch, capsys, *words):
     assert "Traceback" not in out + err
     assert out == ""
     return line
+
+
+def no_belief(count):
+    """Of a controller that knows all, without integral action."""
+    return jax.tree.map(lambda x: np.zeros((count, *x.shape[1:])), no_samples(10, 2).belief)
 
 
 def pretend_walk(seed=0, error=0.03, seconds=4.0, period=0.01, fall_at=None, turn=0.0):
@@ -100,6 +105,7 @@ def pretend_walk(seed=0, error=0.03, seconds=4.0, period=0.01, fall_at=None, tur
         fallen=fallen,
         legs_touch=np.zeros(count, bool),
         residual=np.zeros(count),
+        belief=no_belief(count),
     )
 
 

@@ -6,6 +6,7 @@ that nothing can predict.
 
 import jax
 import numpy as np
+from pretend import no_belief
 
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 
@@ -80,4 +81,5 @@ def synthetic_walk(seed: int, ticks: int = 400, noise: float = 1.0) -> Trajector
         fallen=np.zeros(samples, bool),
         legs_touch=np.zeros(samples, bool),
         residual=np.zeros(samples),
+        belief=no_belief(samples),
     )

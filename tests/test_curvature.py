@@ -11,7 +11,7 @@ from model import ANCHOR, PLAIN, ROBOT, mean_of
 from hector_jax.control.parameters import gradient_by_steps, stepped
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import direction_names, expert
-from hector_jax.tuning.curvature import determined, linearise_jit
+from hector_jax.tuning.curvature import determined, least_squares_jit
 from hector_jax.tuning.difftune import TuneConfig, init, model_objective, trial_weights, update
 from hector_jax.tuning.evaluate import evaluate_jit
 from hector_jax.tuning.loss import PAPER_LOSS, losses, residuals, total
@@ -101,7 +101,7 @@ def test_the_matrix_is_the_curvature_of_the_loss_along_the_change_of_the_residua
 
 def test_loss_and_gradient_come_with_the_matrix():
     scenario, at = Scenario(ROBOT, named_command("s"), ANCHOR, PLAIN), init(CONFIG, START).start
-    found = linearise_jit(CONFIG.rollout, scenario, at, PAPER_LOSS, others=OTHERS)
+    found = least_squares_jit(CONFIG.rollout, scenario, at, PAPER_LOSS, others=OTHERS)
     evaluation = evaluate_jit(CONFIG.rollout, scenario, at, PAPER_LOSS)
     expected = gradient_by_steps(at, evaluation.gradient, OTHERS)
     assert float(found.loss) == pytest.approx(float(evaluation.loss), rel=1e-12)

@@ -45,7 +45,7 @@ off = 0.01 * np.log(request["weights"]["Q"]["position"][1] / 500.0)
 start = np.array([0.0, 0.0, %s])
 log = {
     "period": 0.005,
-    "joints": np.zeros((count, 10)),
+    "joints": 1e-6 * np.sin(t) * np.ones(10),
     "initial.position": start,
     "state.position": start + t * velocity + [0.0, off, 0.0],
     "command.force": np.full((count, 2, 3), 10.0),

@@ -41,6 +41,7 @@ from hector_jax.core.trajectory import FEET
 from hector_jax.importing.soles import Sole, find_soles
 from hector_jax.importing.stand import standing_pose
 from hector_jax.importing.survey import Survey, survey_file
+from hector_jax.robot.checks import expect
 from hector_jax.robot.description import MAX_BYTES, Description, Joints, description_of
 from hector_jax.robot.model import Robot, build_model, conversion, robot_of
 from hector_jax.robot.response import (
@@ -250,7 +251,10 @@ def _gains(robot: Robot, answer: Response) -> dict[str, list[float]]:
     legs = len(robot.foot_point)
     inertia = answer.inertia.reshape(legs, -1).mean(axis=0)
     limit = robot.torque_limit.reshape(legs, -1).min(axis=0)
-    kp = np.minimum(inertia * swing_frequency(answer) ** 2, _KP_PER_LIMIT * limit)
+    frequency, text = swing_frequency(answer), "expected masses and inertias of a walking robot"
+    path = robot.description.model
+    expect(path, np.isfinite(frequency), f"no gains hold the swing legs; {text}")
+    kp = np.minimum(inertia * frequency**2, _KP_PER_LIMIT * limit)
     return {"kp": [_short(x) for x in kp], "kd": [_short(x) for x in np.sqrt(kp * inertia)]}
 
 

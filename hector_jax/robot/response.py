@@ -145,13 +145,19 @@ def swing_frequency(answer: Response) -> float:
         a w (s + w) / s^2  e^(-s delay) / (1 + s lag)
 
     The largest a is the fastest loop, which has the least margin.
+    NaN: there is no such w, because a mass or an inertia is out of all proportion.
     """
     dofs = answer.swing_dofs
     coupled = answer.mobility[np.ix_(dofs, dofs)] * answer.inertia[dofs - 6]
     a = float(np.linalg.eigvals(coupled).real.max())
-    return root_scalar(
-        lambda w: largest_gain(w, TIME_STEP) - a * w, bracket=(1e-3, 0.5 / DELAY)
-    ).root
+
+    def excess(w: float) -> float:
+        return largest_gain(w, TIME_STEP) - a * w
+
+    bracket = 1e-3, 0.5 / DELAY
+    if not excess(bracket[0]) > 0.0 > excess(bracket[1]):
+        return np.nan
+    return root_scalar(excess, bracket=bracket).root
 
 
 def planned_inertia(

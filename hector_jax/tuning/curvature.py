@@ -56,7 +56,7 @@ class Determined(NamedTuple):
         return [name for name, share in self.weights.items() if share < 0.5]
 
 
-class Linearised(NamedTuple):
+class LeastSquares(NamedTuple):
     """The loss of a walk on the model, as a sum of squares to first order in the steps."""
 
     loss: Float[Array, "*batch"]
@@ -66,7 +66,7 @@ class Linearised(NamedTuple):
     residual: Float[Array, "*batch"]  # largest of a QP
 
 
-def linearise(
+def least_squares(
     config: RolloutConfig,
     scenario: Any,
     weights: Weights,
@@ -74,7 +74,7 @@ def linearise(
     *,
     walk: Walk = rollout,
     others: tuple[str, ...] = (),
-) -> Linearised:
+) -> LeastSquares:
     """Compute loss, gradient and Gauss-Newton matrix of a rollout, in forward mode.
 
     With the residuals r and their derivative J these are r'r, 2 J'r and 2 J'J.
@@ -99,21 +99,21 @@ def linearise(
 
     rows, J, trajectory = jax.vmap(tangent_of, out_axes=(None, 0, None))(jnp.eye(len(zero)))
     fallen, residual = jnp.mean(1.0 * trajectory.fallen), jnp.max(trajectory.residual)
-    return Linearised(rows @ rows, 2.0 * J @ rows, 2.0 * J @ J.T, fallen, residual)
+    return LeastSquares(rows @ rows, 2.0 * J @ rows, 2.0 * J @ J.T, fallen, residual)
 
 
 def gauss_newton(
     config: RolloutConfig, scenario: Any, weights: Weights, loss: Loss, **options: Any
 ) -> Float[Array, "n n"]:
-    """Return the matrix of `linearise`."""
-    return linearise(config, scenario, weights, loss, **options).matrix
+    """Return the matrix of `least_squares`."""
+    return least_squares(config, scenario, weights, loss, **options).matrix
 
 
-linearise_jit, gauss_newton_jit = (
+least_squares_jit, gauss_newton_jit = (
     jax.jit(function, static_argnums=0, static_argnames=("walk", "others"))
-    for function in (linearise, gauss_newton)
+    for function in (least_squares, gauss_newton)
 )
-"""`linearise` and `gauss_newton`, compiled once per rollout and set of terms."""
+"""`least_squares` and `gauss_newton`, compiled once per rollout and set of terms."""
 
 
 def determined(
