@@ -41,9 +41,8 @@ Seed = Annotated[int, SEED]
 Seconds = Annotated[float, Range(0.01, 600)]  # at least one tick
 Footsteps = Literal["footstep_feedback", "footstep_width", "turn_lead"]
 Gains = Literal["horizontal_gain", "height_gain", "tilt_gain", "yaw_gain"]
-Groups = Literal["weights", "footsteps", "integral", "all", "legs"]
-Legs = Literal["gravity_compensation", "foot_height", "landing", "kp", "kd"]
-Tunables = Literal[Groups, Footsteps, "effort_reference", "friction", Gains, Legs]
+Groups = Literal["weights", "footsteps", "integral", "all"]
+Tunables = Literal[Groups, Footsteps, "effort_reference", "friction", Gains]
 Variant = Literal["residual", "paper"]
 OneEngine = Literal["c", "mjx", "drake", "pinocchio"]
 Engine = Literal["auto", OneEngine]
@@ -177,7 +176,7 @@ class Tune(Configured, ByWalker, Parallel):
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
     each: bool = False  # tune the trajectories one by one, each in a run folder of its own
     start: Weights = "nominal"  # where to start: nominal, expert, best or a weights file
-    # weights: Q and R; also footsteps, integral, all, legs (with --walks), or numbers by name;
+    # weights: Q and R; also footsteps, integral, all, or numbers by name;
     # `best` has the gains of the integral action in any case
     tune: tuple[Tunables, ...] = ("weights",)
     seeds: Plants = 8  # stand-in plants to evaluate on
@@ -197,7 +196,8 @@ class Tune(Configured, ByWalker, Parallel):
     verdict: bool = False  # print up to 12 walks more: in other engines, or with other masses
     # walks to spend on tuning row `best` further, on the walks themselves (docs/howto/walks.md)
     walks: Annotated[int, Range(0, 100_000)] = 0
-    walk_plants: Annotated[int, Range(0, 1000)] = 2  # drawn plants of these walks; 0: the simulator
+    # drawn plants of these walks, 0 for the simulator; by default so that eight sets walk
+    walk_plants: Annotated[int, Range(0, 1000)] | None = None
     walk_engine: WalkEngine = "c"  # of these walks; c: MuJoCo; extras: drake, pinocchio
     json: bool = False  # print JSON instead of the table; `run` is the folder
     robot: RobotFile = None  # TOML file of another robot, with its data in DATA/NAME; or HECTOR
@@ -213,10 +213,8 @@ class Propose(ForRobot, Parallel, Printed):
     folder: Folder  # of this tuning; a later call needs no other flag
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
     start: Weights = "best"  # weights of the first walk: nominal, expert, best or a weights file
-    # weights: Q and R; also footsteps, integral, all, legs, or numbers by name
+    # weights: Q and R; also footsteps, integral, all, or numbers by name
     tune: tuple[Tunables, ...] = ("weights",)
-    every_walk: bool = False  # correct the model by all walks, not the best: where none is repeated
-    seed: Seed = 0  # of the random numbers
 
 
 @_command

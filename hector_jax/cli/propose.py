@@ -12,7 +12,7 @@ from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import Propose, Report, named_file
 from hector_jax.cli.parse import as_table, from_file
-from hector_jax.control.parameters import leg_numbers, model_numbers
+from hector_jax.control.parameters import tunables
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import say
 from hector_jax.core.files import locked, make_folder, write_json
@@ -34,18 +34,17 @@ def run_propose(args: Propose) -> None:
     campaign = _campaign(args)
     make_folder(args.folder)
     with locked(args.folder), workers(args.processes, args.cluster) as pool:
-        rows = reported_walks.read_reports(pool, campaign)
-        space = walks.campaign_space(pool, campaign)
-        proposal, _ = walks.next_proposal(pool, campaign, space, rows)
+        found = reported_walks.read_reports(pool, campaign)
         if not path.exists():  # last, so that rejected flags can be corrected
             write_json(path, {"flags": as_table(args)})
-    number = len(rows)
+    number, ended = found.number, found.tuning.reason
     weights = walks.weights_path(args.folder, number)
-    result = {"walk": number, "weights": str(weights), "proposed_by": proposal.method}
+    result = {"walk": number, "weights": str(weights), "ended": ended}
 
     def print_text() -> None:
         names = ", ".join(campaign.commands)
-        print(f"walk {number}, proposed by {proposal.method}: {weights}")
+        again = f", the best set again ({ended})" if ended else ""
+        print(f"walk {number}{again}: {weights}")
         print(f"to be walked on {names} for {campaign.seconds:g} s each; then:")
         logs = " ".join(f"{name}.npz" for name in campaign.commands)
         print(f"hector report {args.folder} {logs}")
@@ -65,21 +64,25 @@ def run_report(args: Report) -> None:
     texts = list(map(str, args.logs))
     files = _files(texts, list(campaign.commands))
     with locked(args.folder), workers(args.processes, args.cluster) as pool:
-        before, proposal = walks.read_record(campaign)
-        number = len(before)
-        if proposal is None:
-            raise InputError(f"{args.folder}: no walk is waited for; begin with hector propose")
+        number = reported_walks.read_reports(pool, campaign).number
         named = [name for name, _ in map(named_file, texts)]
         tracked = _check_logs(campaign, number, files, named)
-        rows = reported_walks.add_report(pool, campaign, proposal, list(files.values()))
-        _, best_number = walks.answer(campaign, walks.campaign_space(pool, campaign), rows)
-    changes = walks.changes_by_walk(rows)
-    last, best = _text(changes[-1]), _text(changes[best_number])
-    weights = walks.weights_path(args.folder, best_number)
-    result = {"walk": number, **changes[-1]._asdict(), "best": best_number, "weights": str(weights)}
+        reported_walks.add_report(campaign, number, list(files.values()))
+        found = reported_walks.read_reports(pool, campaign)
+    sets, best, again = found.tuning.sets, found.tuning.best, found.again
+    changes = walks.changes(sets)
+    change = changes[number] if number < len(sets) else again and again.change
+    weights = walks.weights_path(args.folder, best)
+    result = {"walk": number, "change": change, "best": best, "weights": str(weights)}
+    result |= {"again": again and again._asdict(), "ended": found.tuning.reason}
 
     def print_text() -> None:
-        print(f"walk {number}: {last}; best is walk {best_number}, {best}")
+        chosen = f"{_text(changes[best])}, in the walk that chose it"
+        if again:
+            chosen = f"{_text(again.change)}, in walks that did not choose it"
+        if again and not again.clear:
+            chosen += ": not distinguishable from the start"
+        print(f"walk {number}: {_text(change)}; best is walk {best}, {chosen}")
         print(f"its weights: {weights}; the next ones: hector propose {args.folder}")
 
     print_result(args.json, result | {"logs": tracked}, print_text)
@@ -153,8 +156,8 @@ def _tracking_text(tracked: Mapping[str, Any]) -> str:
     )
 
 
-def _text(change: walks.Change) -> str:
-    return "fell" if change.change is None else f"L {change.change:+.1f} % against the start"
+def _text(change: float | None) -> str:
+    return "fell" if change is None else f"L {change:+.1f} % against the start"
 
 
 def _campaign(args: Propose) -> Campaign:
@@ -165,19 +168,10 @@ def _campaign(args: Propose) -> Campaign:
     """
     robot = jax.tree.map(np.asarray, load_robot(args.robot))
     trajectories = arguments.load_trajectories(args.traj, robot)
-    config = tunings.tune_config(robot, others=model_numbers(args.tune))
+    config = tunings.tune_config(robot, others=tunables(args.tune))
     config = arguments.with_length(config, trajectories[0])
     begun = (args.folder / CONFIG).exists()  # from weights that --start may no longer name
     start = str(walks.weights_path(args.folder, 0)) if begun else args.start
     start = arguments.weights_by_name(start, robot)
     commands = {trajectory.name: trajectory.command for trajectory in trajectories}
-    return Campaign(
-        args.folder,
-        config,
-        robot,
-        start,
-        commands,
-        seed=args.seed,
-        leg_numbers=leg_numbers(args.tune),
-        model="every_walk" if args.every_walk else "grounded",
-    )
+    return Campaign(args.folder, config, robot, start, commands)

@@ -12,19 +12,19 @@ from typing import Any, TypeVar
 from hector_jax.cli import arguments
 from hector_jax.cli.flags import Flags, Tune, with_given
 from hector_jax.cli.parse import as_table, from_file
-from hector_jax.control.controller import walk_config
-from hector_jax.control.parameters import leg_numbers
+from hector_jax.control.parameters import tunables
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.core.environment import code_hash, environment
 from hector_jax.core.files import as_json, make_folder, write_json
-from hector_jax.core.inputs import InputError, plural
+from hector_jax.core.inputs import InputError
 from hector_jax.core.journal import check_settings
 from hector_jax.core.settings import convert
 from hector_jax.robot.model import Robot, load_robot
+from hector_jax.store import tunings
 from hector_jax.store.cache import robot_hash
 from hector_jax.store.folder import CONFIG, VERSIONS, flattened, read_object
 from hector_jax.store.nets import COLLECTION_CODE, load_trained
-from hector_jax.walk_tuning.campaign import with_leg_numbers
+from hector_jax.verdict import choice
 
 F = TypeVar("F", bound=Flags)
 
@@ -52,23 +52,18 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
 
     Raises:
         InputError: there is no such trajectory, their lengths differ, or --walks is too few for
-            them; --walk-engine is not installed; --safe beside a position limit; numbers of the
-            legs without --walks or out of their boxes; --net is not its net.
+            them; --walk-engine is not installed; --safe beside a position limit; --tune names
+            numbers that no gradient tunes; --net is not its net.
     """
     loaded = arguments.load_trajectories(args.traj, robot, "; add --each")
-    count, plants = len(loaded), max(args.walk_plants, 1)
-    if 0 < args.walks < (least := 2 * count * plants):
-        walks = f"{plural(count, 'command')} on {plural(plants, 'plant')}, twice"
-        raise InputError(f"--walks must be 0 or at least {least} ({walks}), got {args.walks}")
+    if args.walks:
+        choice.walk_plants(robot, args.walk_plants, args.walks, len(loaded))
     _check_walker(args)
     if args.net:
         load_trained(args.net, robot, args.variant)
     arguments.engine_of(args)  # whether it is installed
-    start, of_legs = arguments.weights_by_name(args.start, robot), leg_numbers(args.tune)
-    if of_legs and not args.walks:
-        text = "only --walks can tune what the rigid-body model does not have"
-        raise InputError(f"--tune {' '.join(of_legs)}: {text}")
-    with_leg_numbers(walk_config(robot), start, of_legs)  # checks them before anything is tuned
+    start = arguments.weights_by_name(args.start, robot)
+    tunings.tune_config(robot, others=tunables(args.tune))  # checks them before anything is tuned
     if args.safe and "position_limit" in start.others:
         raise InputError("--safe sets the position limit, which --start has already")
     return loaded

@@ -17,7 +17,7 @@ from hector_jax.cli.flags import BASELINES, Tune, Walk
 from hector_jax.cli.parse import as_command, latest_run
 from hector_jax.cli.verdict import small_verdict
 from hector_jax.cli.walker import tune_walker
-from hector_jax.control.parameters import leg_numbers, model_numbers, step_names
+from hector_jax.control.parameters import step_names, tunables
 from hector_jax.control.reference import Command
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import Weights, expert, nominal
@@ -46,7 +46,7 @@ from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.evaluate import aligned
 from hector_jax.verdict import choice, judging, metrics
 from hector_jax.verdict.judging import ScoredWalks
-from hector_jax.walk_tuning.walks import Campaign, Row, candidates, changes_by_walk, tune_on_walks
+from hector_jax.walk_tuning.walks import Campaign, WalkTuning, tune_on_walks
 
 _ARTEFACTS = "kept"  # folder in it
 
@@ -119,15 +119,14 @@ class _Tuned(NamedTuple):
     tunings: dict[str, Tuning]
     sets: dict[str, Weights]
     chosen: str  # "iteration 5", the one of its tuning that is `best`
-    proposals: list[Row]  # of a tuning on walks; empty without
-    best_proposal: str  # "set 3", the one that is `best` in place of it; empty without
+    walks: WalkTuning | None  # whose result is `best` in place of it; None without --walks
 
 
 def _begin(pool: Executor, folder: Path, args: Tune) -> _Run:
     """Read what the flags name, but the net."""
     robot = load_robot(args.robot)
     trajectories = run_folder.trajectories(args, robot)
-    config = tunings.tune_config(robot, iterations=args.iterations, others=model_numbers(args.tune))
+    config = tunings.tune_config(robot, iterations=args.iterations, others=tunables(args.tune))
     config = arguments.with_length(config, trajectories[0])
     start = arguments.weights_by_name(args.start, robot)
     return _Run(Setup(pool, config, robot), folder, args, start, trajectories)
@@ -180,9 +179,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         determined=known,
         errors=net.errors,
         tunings=tuned.tunings,
-        proposals=changes_by_walk(tuned.proposals),
-        best_proposal=tuned.best_proposal,
-        cases=len(tuned.proposals[0].losses) if tuned.proposals else 0,
+        walks=tuned.walks,
         chosen=tuned.chosen,
         smooth=args.smooth,
         draws=choice.DRAWS,
@@ -272,17 +269,14 @@ def _tune_sets(run: _Run, net: nets.TrainedNet) -> _Tuned:
         **{name: tuning.weights for name, tuning in done.items()},
         "best": points[chosen],
     }
-    proposals, best = [], ""
     _save_sets(run, sets)  # a tuning on walks may be long: what there is can be used meanwhile
+    walks = None
     if run.args.walks:
-        sets["before_walks"] = sets.pop("best")
-        campaign = _campaign(run, sets["before_walks"])
-        proposals = tune_on_walks(setup.pool, campaign, run.args.walks)
-        stages, options["engine"] = candidates(setup.pool, campaign, proposals), campaign.engine
-        best = choice.walks_best(setup, stages, commands, choice.HELD_OUT, **options)
-        sets["best"] = stages[best]
+        sets["before_walks"] = sets["best"]
+        walks = tune_on_walks(setup.pool, _campaign(run, sets["best"]), walks=run.args.walks)
+        sets["best"] = walks.sets[walks.best].weights
         _save_sets(run, sets)
-    return _Tuned(net, done, sets, chosen, proposals, best)
+    return _Tuned(net, done, sets, chosen, walks)
 
 
 def _save_sets(run: _Run, sets: Mapping[str, Weights]) -> None:
@@ -293,19 +287,10 @@ def _save_sets(run: _Run, sets: Mapping[str, Weights]) -> None:
 
 def _campaign(run: _Run, start: Weights) -> Campaign:
     """Return the settings of the tuning on the walks of --walks, from the result of the tunings."""
-    robot, (config, _) = run.setup.robot, run.settings_of_best
-    config = replace(config, others=run.setup.config.others)
-    plants = choice.drawn_plants(robot, run.args.walk_plants) or [hfs(robot.description)]
-    return Campaign(
-        run.folder / "walks",
-        config,
-        robot,
-        start,
-        run.commands,
-        plants,
-        leg_numbers=leg_numbers(run.args.tune),
-        engine=arguments.engine_of(run.args),
-    )
+    robot, args, (config, _) = run.setup.robot, run.args, run.settings_of_best
+    plants = choice.walk_plants(robot, args.walk_plants, args.walks, len(run.commands))
+    inputs = run.folder / "walks", config, robot, start, run.commands, plants
+    return Campaign(*inputs, arguments.engine_of(args))
 
 
 def _walk_sets(
@@ -362,9 +347,8 @@ def _result(
     if len(names) > 1:
         by_name |= {name: verdict([name], 0) for name in names}
         result["trajectories"] = {name: content([name], by_name[name]) for name in names}
-    if tuned.proposals:
-        result["walks"] = [change._asdict() for change in changes_by_walk(tuned.proposals)]
-        result["best_of_walks"] = tuned.best_proposal
+    if tuned.walks:
+        result["walks"] = tuned.walks.rows
     result["chosen"] = tuned.chosen
     directions = [direction._asdict() for direction in known.directions]
     result["determined"] = {"directions": directions, "weights": known.weights}

@@ -31,7 +31,7 @@ from hector_jax.store.folder import RESULT
 from hector_jax.store.setup import Setup
 from hector_jax.verdict import choice, judging, metrics
 from hector_jax.walk_tuning.campaign import Campaign
-from hector_jax.walk_tuning.walks import answer, campaign_space, changes_by_walk, tune_on_walks
+from hector_jax.walk_tuning.walks import tune_on_walks
 
 
 def run_check(args: Check) -> None:
@@ -117,15 +117,14 @@ def tune_walker(folder: Path, args: Tune) -> None:
         robot,
         arguments.weights_by_name(args.start, robot),
         {trajectory.name: trajectory.command for trajectory in trajectories},
-        choice.drawn_plants(robot, args.walk_plants) or [hfs(robot.description)],
-        engine=arguments.engine_of(args),
+        choice.walk_plants(robot, args.walk_plants, args.walks, len(trajectories)),
+        arguments.engine_of(args),
     )
     _check_first(args, campaign, seconds)
     with workers(args.processes, args.cluster) as pool:
-        rows = tune_on_walks(pool, campaign, args.walks)
-        weights, number = answer(campaign, campaign_space(pool, campaign), rows)
-        sets, commands = {"set 0": campaign.start, f"set {number}": weights}, campaign.commands
-        setup = Setup(pool, config, robot)
+        tuned = tune_on_walks(pool, campaign, walks=args.walks)
+        sets = {f"set {i}": tuned.sets[i].weights for i in (0, tuned.best)}
+        commands, setup = campaign.commands, Setup(pool, config, robot)
         options = {"seconds": seconds, "folder": folder / "scores", "engine": campaign.engine}
         chosen = choice.walks_best(setup, sets, [*commands.values()], choice.HELD_OUT, **options)
         compared = {"start": sets["set 0"], "best": sets[chosen]}
@@ -141,7 +140,7 @@ def tune_walker(folder: Path, args: Tune) -> None:
     result = {
         **metrics.verdict_result(whole),
         "trajectories": {name: metrics.verdict_result(by_name[name]) for name in by_name},
-        "walks": [change._asdict() for change in changes_by_walk(rows)],
+        "walks": tuned.rows,
         "chosen": chosen,
     }
     write_json(folder / RESULT, result)

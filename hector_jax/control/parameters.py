@@ -31,6 +31,7 @@ from hector_jax.control.weights import (
     directions,
     nominal,
     scale_weights,
+    weight_names,
     weights_to_vector,
 )
 from hector_jax.core.arrays import Array
@@ -58,7 +59,7 @@ class Tunable(NamedTuple):
 
     @property
     def of_legs(self) -> bool:
-        """True if the rigid-body model does not have it, so that only walks can tune it."""
+        """True if the rigid-body model does not have it, so that no gradient tunes it."""
         return self.path.startswith("legs.")
 
     @property
@@ -115,11 +116,10 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "footsteps": _FOOTSTEPS,
     "integral": _INTEGRAL,
     "all": (*_FOOTSTEPS, "effort_reference", *_INTEGRAL),
-    "legs": ("gravity_compensation", "foot_height", "landing", "kp", "kd"),
 }
 """Groups of numbers that are tuned together. Friction and step width are in none of them: the
-tuner's model knows neither the friction of the ground nor collisions of the legs. Only walks tune
-those of `legs`, which are not in `all`."""
+tuner's model knows neither the friction of the ground nor collisions of the legs. Those of the legs
+are in none either: the model has no legs, and a weights file sets them."""
 
 
 def tunables(names: Iterable[str]) -> tuple[str, ...]:
@@ -129,21 +129,6 @@ def tunables(names: Iterable[str]) -> tuple[str, ...]:
     ('footstep_feedback', 'turn_lead')
     """
     return tuple(dict.fromkeys(member for name in names for member in GROUPS.get(name, (name,))))
-
-
-def leg_numbers(names: Sequence[str]) -> tuple[str, ...]:
-    """Return those of the tunable names that only walks tune; see `tunables`.
-
-    >>> leg_numbers(["turn_lead", "foot_height"])
-    ('foot_height',)
-    """
-    return tuple(n for n in tunables(names) if n in TUNABLES and TUNABLES[n].of_legs)
-
-
-def model_numbers(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the other tunable names; see `leg_numbers`."""
-    of_legs = leg_numbers(names)
-    return tuple(name for name in tunables(names) if name not in of_legs)
 
 
 def out_of_box(name: str, start: Any) -> str:
@@ -221,20 +206,17 @@ def step_bounds(
     return lower, upper
 
 
-def checked_bounds(start: Weights, others: Sequence[str] = ()) -> Float[np.ndarray, "n 2"]:
-    """Return the `step_bounds` from a start in the box, as two columns.
-
-    Raises:
-        InputError: the start lies outside the box, or its feet differ.
-    """
+def check_in_box(start: Weights, others: Sequence[str] = ()) -> None:
+    """Raise an InputError unless a tuning can start from weights: all numbers are in their box."""
     trees = (start, *bounds(like=start))
     at, low, high = (np.asarray(weights_to_vector(w), float) for w in trees)
-    if any(np.any(part != part[:1]) for part in start.R):
-        raise InputError("a search needs a start whose feet share one R; these differ")
-    if not ((low <= at) & (at <= high)).all():
-        box = ", ".join(f"{n} {x.lower:g} to {x.upper:g}" for n, x in {"Q": Q, "R": R}.items())
-        raise InputError(f"the start lies outside the box of weights: {box}")
-    return np.stack(step_bounds(start, others), axis=1)
+    for name, value, least, most in zip(weight_names(start), at, low, high, strict=True):
+        if not least <= value <= most:
+            text = f"a tuning starts from weights of {least:g} to {most:g}"
+            raise InputError(f"{name} is {value:g}; {text}")
+    for name in others:
+        if reason := out_of_box(name, start.others[name]):
+            raise InputError(reason)
 
 
 def weights_after(

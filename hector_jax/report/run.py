@@ -27,8 +27,7 @@ def write_run_report(folder: Path, **contents: Any) -> Path:
             norms: gradient norms of the terms in log-weights at nominal, by model.
             determined: what the tuning `with` knows about its weights.
             errors: held-out errors of `raw`, `linear`, `net`, from `training.errors_by_phi`.
-            proposals, best_proposal, cases: `Change`s of the tuning on walks; name of the set that
-                is `best`; number of walks per weight set.
+            walks: the `WalkTuning` that made `best`; None without --walks.
             chosen: name of the iteration that is `best`.
             smooth: price of changes of the command between switches of stance in `best`.
             draws: variations of the model for each trajectory of `best`.

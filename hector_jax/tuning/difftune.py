@@ -42,11 +42,11 @@ from hector_jax.tuning.status import StepStatus, Stop, status_text
 from hector_jax.tuning.step_rules import StepState
 
 LEAST_GAIN = 5e-3
-"""Share of the objective that a Gauss-Newton step must be predicted to gain."""
+"""Share of the objective that a Gauss-Newton step of one e-fold must be predicted to gain."""
 SMALLEST_STEP = 1 / 128
 """Share of the full gradient step below which a tuning ends."""
-MISSES = 2
-"""Wrong predictions in a row after which a tuning ends: the loss is rougher than its gain."""
+SMALLEST_REGION = 1 / 100
+"""Radius [e-folds] below which a tuning ends: the loss is rougher than its gain."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def _why_not_tunable(walk: WalkConfig, name: str) -> str:
     if tunable.of_legs:
         return (
             f"{name} cannot be tuned by gradients: the rigid-body model has no joints, so its "
-            "gradient is zero; a weights file can set it, or --walks tune it"
+            "gradient is zero; a weights file can set it"
         )
     if name == "position_limit":
         return (
@@ -156,8 +156,7 @@ class Tuning(NamedTuple):
             Stop.GOING: "not ended",
             Stop.LIMIT: plural(len(self.history.iteration) - 1, "iteration"),
             Stop.SMALL_STEP: "the step became too small to gain",
-            Stop.NO_GAIN: f"the next step was predicted to gain less than {LEAST_GAIN:.1%}",
-            Stop.ROUGH: f"{MISSES} steps in a row did not gain what was predicted",
+            Stop.NO_GAIN: f"a step of one e-fold was predicted to gain less than {LEAST_GAIN:.1%}",
             Stop.BAD_START: "the starting weights were refused",
         }[Stop(int(self.stop))]
 
@@ -248,19 +247,19 @@ def update(
     value = jnp.where(usable, evaluation.loss, jnp.inf)
     rule, trial = step_rule(config, state.start), trial_weights(config, state)
     gradient = parameters.gradient_by_steps(trial, evaluation.gradient, config.others)
-    given = {"value": value, "matrix": matrix}
+    box = parameters.step_bounds(state.start, config.others)
+    given = {"value": value, "matrix": matrix, "box": box}
     updates, after = rule.update(gradient, state.rule, state.steps, **given)
     after = cast(StepState, after)
-    steps = optax.apply_updates(state.steps, updates)
-    lower, upper = parameters.step_bounds(state.start, config.others)
-    steps = optax.projections.projection_box(steps, lower, upper)
+    steps = optax.projections.projection_box(optax.apply_updates(state.steps, updates), *box)
 
     stop = jnp.where(iteration >= config.iterations, Stop.LIMIT, Stop.GOING)
     if config.rule == "gauss_newton":
-        gain = step_rules.predicted_gain(config.ridge, after, steps)
+        step = step_rules.boxed_step(config.ridge, after, box, 1.0)
+        gain = step_rules.predicted_gain(config.ridge, after, after.steps + step)
         least = LEAST_GAIN * step_rules.objective(config.ridge, after, after.steps, after.value)
+        stop = jnp.where(after.size < SMALLEST_REGION, Stop.SMALL_STEP, stop)
         stop = jnp.where(~(gain >= least), Stop.NO_GAIN, stop)
-        stop = jnp.where(after.misses >= MISSES, Stop.ROUGH, stop)
     else:
         stop = jnp.where(after.size < SMALLEST_STEP, Stop.SMALL_STEP, stop)
     stop = jnp.where(~begun & (status != StepStatus.ACCEPTED), Stop.BAD_START, stop)
@@ -323,11 +322,14 @@ def descend(
         on_iteration: called after each iteration.
 
     Raises:
-        InputError: the starting weights are rejected, after a call of `on_iteration`.
+        InputError: the starting weights are outside the box, or are rejected, after a call of
+            `on_iteration`.
     """
     history: list[Iteration] = []
     state, static = init(config, weights), replace(config, loss=PAPER_LOSS)  # one program for all
+    parameters.check_in_box(state.start, config.others)
     while state.stop == Stop.GOING:
+        state = objective.place(state)
         # copies, because a view would keep the device's array for as long as the history
         trial = jax.tree.map(np.array, trial_weights(config, state))
         evaluation, matrix = jax.tree.map(np.array, objective.evaluate(trial)), state.rule.matrix

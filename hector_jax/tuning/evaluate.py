@@ -70,6 +70,8 @@ class Objective(NamedTuple):
 
     evaluate: Callable[[Weights], Evaluation]
     matrix: Callable[[Weights], Any]  # Gauss-Newton matrix (n, n) in the steps of the tuning
+    # takes the state of a tuning to the point that is evaluated, if that is given
+    place: Callable[[Any], Any] = lambda state: state
 
 
 def mean_objective(

@@ -20,10 +20,9 @@ class Stop(IntEnum):
 
     GOING = 0
     LIMIT = 1  # all iterations are done
-    SMALL_STEP = 2  # of the paper's rules
+    SMALL_STEP = 2  # too short to gain: the loss is rougher than its gain, or all is refused
     NO_GAIN = 3  # too little is predicted
-    ROUGH = 4  # predictions were wrong
-    BAD_START = 5  # the start was rejected
+    BAD_START = 4  # the start was rejected
 
 
 REASONS = {

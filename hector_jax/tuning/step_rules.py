@@ -4,7 +4,7 @@ The coordinates z of a tuning are log-steps of the weights from the start, and s
 numbers as shares of their box (`parameters.stepped`). A rule takes the gradient of the loss by z at
 the point that was evaluated last, with the loss itself, and returns the update to the next point:
 
-    updates, state = rule.update(gradient, state, z, value=loss, matrix=hessian)
+    updates, state = rule.update(gradient, state, z, value=loss, matrix=hessian, box=bounds)
     z = optax.apply_updates(z, updates)
 
 An infinite value says that the point is refused, for example because the robot fell. A point that
@@ -23,15 +23,16 @@ from jaxtyping import Bool, Float, Int
 
 from hector_jax.core.arrays import Array
 
-LEAST, POOR, GOOD, OPTIMISTIC = 0.01, 0.25, 0.6, 4.0
+LEAST, POOR, GOOD = 0.01, 0.25, 0.6
 """Ratios of true to predicted gain: a step of less than the least is refused; below the poor one
-the trust region shrinks, above the good one it grows; above the last one the model is wrong too."""
+the trust region shrinks, above the good one it grows."""
 LARGEST = 4.0
 """Largest radius of the trust region [e-folds]."""
+_ROUNDS = 8  # of a step in the box, in which walls are held and released
 
 
 class StepState(NamedTuple):
-    """State of a rule; all but `size`, `first` and `misses` belong to the last accepted point."""
+    """State of a rule; all but `size` and `first` belong to the last accepted point."""
 
     size: Float[Array, ""]  # radius of the trust region, or share of the full step
     steps: Float[Array, " n"]  # z
@@ -39,14 +40,13 @@ class StepState(NamedTuple):
     first: Float[Array, ""]  # the loss at the start
     gradient: Float[Array, " n"]
     matrix: Float[Array, "n n"]  # Gauss-Newton matrix
-    misses: Int[Array, ""]  # ratios in a row that were poor or optimistic
 
 
 def _init(steps: Float[Array, " n"]) -> StepState:
     # of the later type, or `update` is compiled again
     one, infinite = (jnp.asarray(x, steps.dtype) for x in (1.0, jnp.inf))
     zeros, matrix = jnp.zeros_like(steps), jnp.zeros((len(steps), len(steps)), steps.dtype)
-    return StepState(one, steps, infinite, infinite, zeros, matrix, jnp.zeros((), jnp.int32))
+    return StepState(one, steps, infinite, infinite, zeros, matrix)
 
 
 def _model(ridge: float, state: StepState) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
@@ -78,9 +78,42 @@ def gain_ratio(
     return gain / jnp.maximum(predicted_gain(ridge, state, steps), jnp.finfo(gain.dtype).tiny)
 
 
-def _trusted_step(ridge: float, state: StepState) -> Float[Array, " n"]:
-    """Return the step that minimises the model of the objective within the trust region."""
+Box = tuple[Any, Any]
+"""Lower and upper bounds (n,) of z."""
+
+
+def boxed_step(ridge: float, state: StepState, box: Box, size: Any = None) -> Float[Array, " n"]:
+    """Return the step of least objective, by its model, within the trust region and the box.
+
+    Walls that the step would go beyond are held at their distance, and the other coordinates
+    solved again with them, until none need be held or released: a step that is clipped need not go
+    down if coordinates are coupled.
+
+    Args:
+        ridge, state: of the rule.
+        box: of z.
+        size: radius; that of the state by default.
+    """
     slope, curvature = _model(ridge, state)
+    low, high = box[0] - state.steps, box[1] - state.steps
+    size = state.size if size is None else size
+    held, step = jnp.zeros(len(slope), bool), jnp.zeros_like(slope)
+    for _ in range(_ROUNDS):
+        at = jnp.where(held, step, 0.0)
+        free = jnp.where(held, 0.0, slope + curvature @ at)
+        coupled = jnp.where(held[:, None] | held, 0.0, curvature) + jnp.diag(1.0 * held)
+        step = jnp.where(held, at, _trusted_step(free, coupled, size))
+        beyond, step = (step < low) | (step > high), jnp.clip(step, low, high)
+        uphill = slope + curvature @ step
+        outward = ((step <= low) & (uphill > 0.0)) | ((step >= high) & (uphill < 0.0))
+        held = beyond | (held & outward)
+    return step
+
+
+def _trusted_step(
+    slope: Float[Array, " n"], curvature: Float[Array, "n n"], size: Float[Array, ""]
+) -> Float[Array, " n"]:
+    """Return the step that minimises a quadratic model within a ball."""
     values, vectors = jnp.linalg.eigh(curvature)
     values = jnp.maximum(values, 1e-9 * values[-1] + jnp.finfo(values.dtype).tiny)
     along = vectors.T @ slope
@@ -90,10 +123,10 @@ def _trusted_step(ridge: float, state: StepState) -> Float[Array, " n"]:
         scaled = along / (values + damping)
         square = scaled @ scaled
         descent = jnp.where(square > 0.0, scaled @ (scaled / (values + damping)), 1.0)
-        excess = jnp.sqrt(square) / state.size - 1.0
+        excess = jnp.sqrt(square) / size - 1.0
         return jnp.maximum(damping + excess * square / descent, 0.0)
 
-    least = jnp.maximum(jnp.linalg.norm(along) / state.size - values[-1], 0.0)
+    least = jnp.maximum(jnp.linalg.norm(along) / size - values[-1], 0.0)
     damping = jax.lax.fori_loop(0, 40, improve, least)
     return -vectors @ (along / (values + damping))
 
@@ -114,6 +147,7 @@ def trust_region(ridge: float) -> optax.GradientTransformationExtraArgs:
         *,
         value: Float[Array, ""],
         matrix: Float[Array | np.ndarray, "n n"],
+        box: Box = (-jnp.inf, jnp.inf),
     ) -> tuple[Float[Array, " n"], StepState]:
         begun, finite = jnp.isfinite(state.value), jnp.isfinite(value)
         ratio = gain_ratio(ridge, state, params, value)
@@ -123,12 +157,9 @@ def trust_region(ridge: float) -> optax.GradientTransformationExtraArgs:
         size = jnp.where((ratio > GOOD) & (length > 0.9 * state.size), larger, state.size)
         size = jnp.where(ratio < POOR, length / 4.0, size)
         size = jnp.where(accepted, size, length / 8.0)
-        misses = jnp.where((ratio < POOR) | (ratio > OPTIMISTIC), state.misses + 1, 0)
-        counts = begun & finite  # a fall says nothing of the prediction
         kept = _keep(state, accepted, steps=params, value=value, gradient=updates, matrix=matrix)
         kept = kept._replace(size=jnp.where(begun, size, state.size))
-        kept = kept._replace(misses=jnp.where(counts, misses, state.misses))
-        return kept.steps + _trusted_step(ridge, kept) - params, kept
+        return kept.steps + boxed_step(ridge, kept, box) - params, kept
 
     return optax.GradientTransformationExtraArgs(_init, update)  # pyright: ignore
 

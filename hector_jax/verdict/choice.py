@@ -18,9 +18,9 @@ from hector_jax.control.parameters import GROUPS, TUNABLES
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights
 from hector_jax.core.console import say
-from hector_jax.core.inputs import plural
+from hector_jax.core.inputs import InputError, plural
 from hector_jax.robot.model import Robot
-from hector_jax.sim.world import Imperfections, hfs_with_motors, noisy
+from hector_jax.sim.world import Imperfections, hfs, hfs_with_motors, noisy
 from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.loss import smoother
@@ -33,6 +33,7 @@ centre of mass, unless one is given; width and velocity feedback of the steps as
 controller's. With them fewer walks fall under pushes and on slippery floors."""
 SHARES = (0.0, 0.25, 0.5, 1.0)  # of the accepted iterations: the points of a path that walk
 _FIRST_SEED = 7000  # of plants that a tuning may walk on; those of a path have the seeds before
+SETS, MOST_PLANTS = 8, 16  # that a budget of walks is spent on, unless plants are given
 HELD_OUT = range(8000, 8008)
 """Seeds of the plants that compare the sets of a tuning on walks: those of a path have chosen the
 start of these walks already, and there it is lucky."""
@@ -44,6 +45,27 @@ def drawn_plants(robot: Robot, count: int, first_seed: int = _FIRST_SEED) -> lis
         hfs_with_motors(seed, 0.4, robot.description)._replace(estimator=noisy())
         for seed in range(first_seed, first_seed + count)
     ]
+
+
+def walk_plants(robot: Robot, count: int | None, walks: int, commands: int) -> list[Imperfections]:
+    """Return the plants of a tuning on walks.
+
+    Args:
+        robot: that walks.
+        count: their number, 0 for the hfs itself; None: as many as leave SETS sets to walk.
+        walks: budget.
+        commands: number of commands.
+
+    Raises:
+        InputError: the budget is less than two walks in each case.
+    """
+    if count is None:
+        count = int(np.clip(walks // (SETS * commands), 1, MOST_PLANTS))
+    plants = drawn_plants(robot, count) or [hfs(robot.description)]
+    if walks < (least := 2 * len(plants) * commands):
+        cases = f"{plural(commands, 'trajectory')} on {plural(len(plants), 'plant')}"
+        raise InputError(f"--walks must be at least {least}, two sets for {cases}, got {walks}")
+    return plants
 
 
 def settings_of_best(

@@ -1,77 +1,124 @@
 """Walks that were made elsewhere, on a robot or in another simulator, and whose logs are reported.
 
 They are data: the files that were reported are kept as they came, and each call scores them anew,
-so that all are of one code and one loss.
+so that all are of one code and one loss. When the tuning has ended the best set is walked again:
+what is said of it then does not rest on the walk that chose it.
 """
 
 import hashlib
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from hector_jax.control.weights_file import load_weights
+from hector_jax.control.weights import Weights
+from hector_jax.control.weights_file import save_weights
 from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError
-from hector_jax.search.few_walks import Proposal
 from hector_jax.walk_tuning import walks
-from hector_jax.walk_tuning.campaign import Campaign, point_of
+from hector_jax.walk_tuning.campaign import Campaign
+from hector_jax.walk_tuning.walk_log import ScoredLog, evaluate_log, read_log
+from hector_jax.walk_tuning.walks import WalkTuning
+
+_MOST = 10_000  # iterations: a person ends the tuning
+_CLEAR = 2.0  # standard deviations of a change that is no chance
 
 
-def read_reports(pool: Executor, campaign: Campaign) -> list[walks.Row]:
+class Again(NamedTuple):
+    """What the walks of the best set tell that did not choose it."""
+
+    change: float  # [%] mean change of log L against the start
+    clear: bool  # against the spread of its walks
+
+
+class Reports(NamedTuple):
+    """The walks of a folder."""
+
+    tuning: WalkTuning
+    waiting: Weights  # the set to walk next
+    number: int  # of that set
+    again: Again | None  # None: the best set has not walked again
+
+
+def read_reports(pool: Executor, campaign: Campaign) -> Reports:
     """Return the walks so far, scored by the present code; begin the record if it is new.
 
     Raises:
-        InputError: see `walks.read_record`; or the weights or a log of a walk are damaged.
+        InputError: see `walks.tune_on_walks`; or the weights or a log of a walk are damaged.
     """
-    (rows, _), space = walks.read_record(campaign), walks.campaign_space(pool, campaign)
-    for number, old in enumerate(rows):
-        weights = load_weights(walks.weights_path(campaign.folder, number), campaign.robot)
-        point = point_of(campaign, space, weights)
-        if np.allclose(point, old.point, rtol=0.0, atol=1e-9):  # else the code places it elsewhere
-            point = old.point
-        proposal = Proposal(point, old.method, old.predicted)
-        row = walks.row_of(proposal, walks.evaluate_logs(pool, campaign, number))
-        same_loss = np.allclose(row.losses, old.losses, rtol=1e-6)  # as was predicted
-        rows[number] = row if same_loss else row._replace(predicted=None)
-    return rows
+    campaign = replace(campaign, config=replace(campaign.config, iterations=_MOST))
+    ask = partial(_scored, pool, campaign)
+    tuning = walks.tune_on_walks(pool, campaign, ask)
+    number = len(tuning.sets)
+    if tuning.waiting is not None:
+        return Reports(tuning, tuning.waiting, number, None)
+    best, again = tuning.sets[tuning.best], []
+    while all(path.exists() for path in walks.log_paths(campaign, number)):
+        again.append(np.array([score.loss for score, _ in ask(number, best.weights)]))
+        number += 1
+    path = walks.weights_path(campaign.folder, number)
+    if not path.exists():
+        save_weights(path, best.weights)
+    return Reports(tuning, best.weights, number, _again(tuning, again) if again else None)
 
 
-def add_report(
-    pool: Executor, campaign: Campaign, proposal: Proposal, files: Sequence[Path]
-) -> list[walks.Row]:
-    """Save a walk in the folder, first copies of its logs, then its line; return all rows."""
-    rows, _ = walks.read_record(campaign)
-    number, logs = len(rows), [file.read_bytes() for file in files]
-    _set_aside(campaign, number)  # logs of a report that was undone or interrupted
-    for path, log in zip(walks.log_paths(campaign, number), logs, strict=True):
+def _again(tuning: WalkTuning, again: Sequence[np.ndarray]) -> Again:
+    start, best = (np.log(tuning.sets[i].losses).mean() for i in (0, tuning.best))
+    logs = np.array([np.log(losses).mean() for losses in again])
+    spread = np.std([best, *logs], ddof=1) * np.sqrt(1.0 + 1.0 / len(logs))
+    change = logs.mean() - start
+    return Again(100.0 * float(np.expm1(change)), bool(abs(change) > _CLEAR * spread))
+
+
+def _scored(
+    pool: Executor, campaign: Campaign, number: int, weights: Weights
+) -> Sequence[ScoredLog]:
+    """Return the scored logs of a set that was reported; `Waiting` if it was not."""
+    paths = walks.log_paths(campaign, number)
+    if not all(path.exists() for path in paths):
+        raise walks.Waiting
+    config, robot, running = campaign.config, campaign.robot, []
+    for path, (_, command) in zip(paths, campaign.cases, strict=True):
+        log = read_log(path, robot, campaign.seconds, config.rollout.walk.gait.tick)
+        running.append(pool.submit(evaluate_log, config, robot, command, log))
+    return [job.result() for job in running]
+
+
+def add_report(campaign: Campaign, number: int, files: Sequence[Path]) -> None:
+    """Save the logs of a set in the folder, the last one last: with it the set has walked."""
+    logs = [file.read_bytes() for file in files]
+    paths = walks.log_paths(campaign, number)
+    _set_aside(paths)  # logs of a report that was interrupted
+    for path, log in zip(paths, logs, strict=True):
         write_file(path, log)
-    walks.add_walk(campaign, rows, proposal, walks.evaluate_logs(pool, campaign, number))
-    return read_reports(pool, campaign)
 
 
 def undo_report(campaign: Campaign) -> tuple[int, list[Path]]:
-    """Take back the last report; its proposal, which is still there, waits for its walk again.
+    """Take back the last report; its set waits for its walk again.
 
     Returns:
-        Number of the walk, and its logs under the names that they have from now on.
+        Number of the set, and its logs under the names that they have from now on.
 
     Raises:
-        InputError: there is none, or see `walks.read_record`.
+        InputError: there is none.
     """
-    (rows, _), path = walks.read_record(campaign), campaign.folder / walks.RECORD
-    if not rows:
+    number = 0
+    while all(path.exists() for path in walks.log_paths(campaign, number)):
+        number += 1
+    if not number:
         raise InputError(f"{campaign.folder}: no report to undo")
-    # The one step that counts. Settings, proposals and walks stay up to the last proposal walked.
-    lines = path.read_bytes().splitlines(keepends=True)
-    write_file(path, b"".join(lines[: 2 * len(rows)]))
-    number = len(rows) - 1
-    return number, _set_aside(campaign, number)
+    for path in walks.weights_path(campaign.folder, number).parent.glob("*.json"):
+        if path.stem.isdigit() and int(path.stem) >= number:
+            path.unlink()  # of the set that this walk has led to
+    return number - 1, _set_aside(walks.log_paths(campaign, number - 1))
 
 
-def _set_aside(campaign: Campaign, number: int) -> list[Path]:
-    """Rename the logs of a walk that is not in the record; return their new names."""
-    logs = {path: path.read_bytes() for path in walks.log_paths(campaign, number) if path.exists()}
+def _set_aside(paths: Sequence[Path]) -> list[Path]:
+    """Rename logs that no longer count; return their new names."""
+    logs = {path: path.read_bytes() for path in paths if path.exists()}
     hashes = {path: hashlib.sha256(data).hexdigest()[:8] for path, data in logs.items()}
     return [path.replace(path.with_stem(f"{path.stem}-undone-{x}")) for path, x in hashes.items()]

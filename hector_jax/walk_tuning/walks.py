@@ -1,64 +1,117 @@
-"""Tuning on few walks: a folder in which proposals and the logs of their walks alternate.
+"""Tuning on walks: the loop of a tuning whose value is walks, whose slope the model's on each.
 
-Whether a simulator (`tune_on_walks`) or a real robot (`hector propose`, `hector report`) walks, the
-same functions read the logs and make the proposals (search/few_walks.py), and all that they use is
-in the folder:
+A weight set walks in each case, a command on a plant; its value is the mean of log L over the
+cases. Gradient and Gauss-Newton matrix are those of the rigid body grounded on each of these walks
+(tuning/grounded.py), each divided by its loss. Steps, acceptance and stop are those of
+`difftune.descend`. A fall counts as a bounded loss of its case and has no slope; the rest still
+steers. Whether a simulator (`walk_all`) or a real robot (`reported_walks`) walks, all that the loop
+uses is in a folder, so that it begins anew in each call and no walk is made twice:
 
-- `walks.jsonl`: settings, then a line for each proposal and, once it was walked, one for its walk.
-- `logs/3-0.npz`: the log of walk 3 in case 0, at the plan interval, or the file that was reported.
-- `weights/3.json`: the weights of walk 3.
-- `metric.npz`: the Gauss-Newton matrix at the start, which defines the coordinates of all points.
-
-A weight set is walked in each case: all commands, on each plant. Its loss is the mean over the
-cases, each divided by its loss at the start, so that all count alike.
+- `walks.jsonl`: the settings, then a line for each weight set that has walked.
+- `weights/3.json`: the weights of set 3.
+- `logs/3-0.npz`: its log in case 0, at the plan interval, or the file that was reported.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
+from functools import partial
 from itertools import repeat
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from hector_jax.control.parameters import steps_between
+from hector_jax.control import parameters
+from hector_jax.control.reference import standing_anchor
 from hector_jax.control.weights import Weights, direction_names
-from hector_jax.control.weights_file import save_weights, weights_tree
-from hector_jax.core.console import bar, say
+from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
+from hector_jax.core.console import bar
 from hector_jax.core.environment import code_hash
-from hector_jax.core.inputs import InputError, plural
-from hector_jax.core.journal import add_row, continue_journal
+from hector_jax.core.inputs import plural
+from hector_jax.core.journal import continue_journal, write_rows
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
-from hector_jax.search import few_walks
-from hector_jax.search.few_walks import Model, Proposal, Space, WalkResult
+from hector_jax.grfm import network
 from hector_jax.sim.loop import Job
-from hector_jax.store import tunings
 from hector_jax.store.cache import content_key, robot_hash
-from hector_jax.store.setup import Setup
-from hector_jax.walk_tuning import grounded_model
-from hector_jax.walk_tuning.campaign import Campaign, box_of, walker_hash, weights_at
+from hector_jax.store.tunings import evaluation_job, matrix_job
+from hector_jax.tuning import difftune
+from hector_jax.tuning.difftune import Iteration, TuneState, step_status
+from hector_jax.tuning.evaluate import Evaluation, Objective
+from hector_jax.tuning.grounded import Grounding, fit_grounding, grounded_rollout
+from hector_jax.tuning.rollout import Scenario
+from hector_jax.tuning.status import StepStatus
+from hector_jax.walk_tuning.campaign import Campaign, walker_hash
 from hector_jax.walk_tuning.walk_log import (
     Log,
+    LogScore,
     ScoredLog,
     evaluate_log,
     log_of,
-    read_log,
+    trajectory_of,
 )
 
 RECORD = "walks.jsonl"
+_FALL = 1.0  # log L of a fall above the largest of the start
 
 
-class Row(NamedTuple):
-    """A proposal and the results of its walks."""
+class WalkedSet(NamedTuple):
+    """A weight set that has walked."""
 
-    point: Float[np.ndarray, " n"]
-    method: str
-    predicted: float | None
-    losses: Float[np.ndarray, " cases"]  # infinite where the robot fell or a QP was not solved
-    margin: float  # share of the way to a fall, the largest of the cases
+    weights: Weights
+    losses: Float[np.ndarray, " cases"]  # L; infinite where the robot fell or a QP was not solved
+    accepted: bool  # as a step of the tuning
+
+    @property
+    def fell(self) -> Bool[np.ndarray, " cases"]:
+        """True where the robot fell or a QP was not solved."""
+        return ~np.isfinite(self.losses)
+
+
+class WalkTuning(NamedTuple):
+    """The sets that have walked, and what comes next."""
+
+    sets: list[WalkedSet]  # the start first
+    waiting: Weights | None  # the set whose walks are waited for
+    reason: str  # why the tuning ended; empty if it has not
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """The sets as JSON values: mean change of log L against the start [%], falls, step."""
+        return [
+            {"change": change, "falls": int(x.fell.sum()), "accepted": x.accepted}
+            for change, x in zip(changes(self.sets), self.sets, strict=True)
+        ]
+
+    @property
+    def best(self) -> int:
+        """Number of the last accepted set that falls in no more cases than the start."""
+        most = self.sets[0].fell.sum()
+        return max(i for i, x in enumerate(self.sets) if x.accepted and x.fell.sum() <= most)
+
+
+class Waiting(Exception):  # noqa: N818
+    """The walks of a weight set have not been made yet."""
+
+
+Ask = Callable[[int, Weights], Sequence[ScoredLog]]
+"""Returns the scored logs of a set by its number, one for each case, or raises `Waiting`."""
+
+
+def changes(sets: Sequence[WalkedSet]) -> list[float | None]:
+    """Return the mean change of log L against the start [%], over the cases in which both stood."""
+    start = sets[0]
+    both = [~(start.fell | x.fell) for x in sets]
+    return [
+        100.0 * float(np.expm1(np.mean(np.log(x.losses[on] / start.losses[on]))))
+        if on.any()
+        else None
+        for x, on in zip(sets, both, strict=True)
+    ]
 
 
 # Jobs of worker processes
@@ -75,249 +128,182 @@ def walk_case(campaign: Campaign, weights: Weights, case: int) -> ScoredLog:
     return evaluate_log(config, robot, command, log)
 
 
-def row_of(proposal: Proposal, cases: Sequence[ScoredLog]) -> Row:
-    """Return the row of a proposal and the scores of its walks."""
-    losses, margin = zip(*((score.loss, score.margin) for score, _ in cases), strict=True)
-    point, method, predicted = proposal
-    return Row(point, method, predicted, np.array(losses), max(margin))
+def _ground(campaign: Campaign, weights: Weights, case: int, log: Log) -> tuple[Grounding, Any]:
+    """Ground the plain rigid body on a walk; return it and its evaluation."""
+    config, robot = campaign.config, campaign.robot
+    effect = network.effect_of(None, config.rollout.walk)
+    scenario = Scenario(robot, campaign.cases[case][1], standing_anchor(robot), effect)
+    grounding = fit_grounding(config.rollout, scenario, weights, trajectory_of(log))
+    return jax.device_get(grounding), evaluation_job(config, grounding, weights, grounded_rollout)
 
 
-# The folder
+# The objective
 
 
-def campaign_space(pool: Executor, campaign: Campaign) -> Space:
-    """Return the coordinates of all points, from their file or from the model at the start.
+class _Walks:
+    """The objective of `difftune.descend` on walks; remembers the sets."""
+
+    def __init__(self, pool: Executor, campaign: Campaign, ask: Ask) -> None:
+        self.pool, self.campaign, self.ask = pool, campaign, ask
+        self.losses: list[np.ndarray] = []
+        self.slopes: list[tuple[float, Grounding]] = []  # of the set that walked last
+
+    def place(self, state: TuneState) -> TuneState:
+        """Return the state at the set that has walked, should the code place it elsewhere."""
+        path = weights_path(self.campaign.folder, len(self.losses))
+        config = self.campaign.config
+        trial = jax.device_get(difftune.trial_weights(config, state))
+        if not path.exists():
+            save_weights(path, trial)
+        there = load_weights(path, self.campaign.robot)
+        if jax.tree.all(jax.tree.map(np.array_equal, there, trial)):
+            return state
+        steps = parameters.steps_between(state.start, there, config.others)
+        return state._replace(steps=jnp.asarray(steps))
+
+    def evaluate(self, weights: Weights) -> Evaluation:
+        """Walk a set; value and slope of the mean of log L."""
+        campaign, number = self.campaign, len(self.losses)
+        logs = self.ask(number, weights)
+        losses = np.array([score.loss for score, _ in logs])
+        stood = np.isfinite(losses)
+        self.losses.append(losses)
+        start = self.losses[0][np.isfinite(self.losses[0])]
+        worst = np.exp(_FALL) * start.max(initial=1.0)
+        value = float(np.exp(np.mean(np.log(np.where(stood, np.minimum(losses, worst), worst)))))
+        on = np.flatnonzero(stood).tolist()
+        some = [logs[case][1] for case in on]
+        grounded = list(self.pool.map(_ground, repeat(campaign), repeat(weights), on, some))
+        usable = [
+            (grounding, found)
+            for grounding, found in grounded
+            if step_status(campaign.config, found) == StepStatus.ACCEPTED
+        ]
+        if not usable:
+            nothing = jax.tree.map(np.zeros_like, weights)
+            terms = {term.name: np.zeros(()) for term in campaign.config.loss}
+            return Evaluation(np.asarray(value), terms, nothing, np.ones(()), np.zeros(()))
+        shares = [value / len(losses) / float(found.loss) for _, found in usable]
+        self.slopes = [(x, grounding) for x, (grounding, _) in zip(shares, usable, strict=True)]
+
+        def mean(trees: Sequence[Any]) -> Any:
+            scaled = (
+                jax.tree.map(lambda x, k=k: k * x, t) for k, t in zip(shares, trees, strict=True)
+            )
+            return jax.tree.map(lambda *x: np.sum(x, axis=0), *scaled)
+
+        terms, gradient = (
+            mean([getattr(e, name) for _, e in usable]) for name in ("terms", "gradient")
+        )
+        residual = np.max([found.residual for _, found in usable])
+        return Evaluation(np.asarray(value), terms, gradient, np.zeros(()), residual)
+
+    def matrix(self, weights: Weights) -> Float[np.ndarray, "n n"]:
+        """Return the mean of the matrices on the walks of `evaluate`."""
+        job = partial(matrix_job, self.campaign.config, weights=weights, walk=grounded_rollout)
+        shares, groundings = zip(*self.slopes, strict=True)
+        return np.tensordot(shares, list(self.pool.map(job, groundings)), axes=1)
+
+
+def tune_on_walks(
+    pool: Executor, campaign: Campaign, ask: Ask | None = None, walks: int | None = None
+) -> WalkTuning:
+    """Tune on the walks of a campaign, from those in its folder on.
+
+    Args:
+        pool: worker processes.
+        campaign: the settings.
+        ask: makes the walks of a set; by default the engine of the campaign does.
+        walks: budget; whole sets walk in all cases. None: the iterations of the settings.
 
     Raises:
-        InputError: the file of the matrix is damaged, or of another robot.
+        InputError: the folder holds the record of another campaign, or a damaged one; or the start
+            falls in all cases.
     """
-    # reported walks are of the robot's files, however this code reads them: see `walker_hash`
-    robot, path = None if campaign.reported else campaign.robot, campaign.folder / "metric.npz"
-    if not path.exists():
-        problem = tunings.Problem(tuple(campaign.commands.values()), None)
-        setup = Setup(pool, campaign.config, campaign.robot)
-        matrix = tunings.relative_matrix(setup, campaign.start, problem)
-        save_tree(path, {"matrix": matrix}, kind="metric", robot=campaign.robot)
-    tree, _ = load_tree(path, {"matrix": np.zeros((0, 0))}, kind="metric", robot=robot)
-    return few_walks.space_of(tree["matrix"], box_of(campaign))
+    head = _head(campaign)
+    continue_journal(campaign.folder / RECORD, head, "a tuning on walks", dict, _remedy(campaign))
+    config, cases = campaign.config, len(campaign.cases)
+    if walks is not None:
+        config = replace(config, iterations=max(walks // cases - 1, 1))
+    objective = _Walks(pool, campaign, ask or partial(walk_all, pool, campaign))
+    sets: list[WalkedSet] = []
+    with bar(f"tuning on walks, {plural(cases, 'case')}") as report_progress:
+
+        def on_iteration(iteration: Iteration) -> None:
+            losses = objective.losses[-1]
+            sets.append(WalkedSet(iteration.weights, losses, bool(iteration.accepted)))
+            rows = ({"losses": x.losses.tolist(), "accepted": x.accepted} for x in sets)
+            write_rows(campaign.folder / RECORD, [head, *rows])
+            report_progress(len(sets), config.iterations + 1, _progress(campaign, sets))
+
+        report_progress(0, config.iterations + 1, "compiling")
+        try:
+            parts = objective.evaluate, objective.matrix, objective.place
+            tuning = difftune.descend(config, campaign.start, Objective(*parts), on_iteration)
+        except Waiting:
+            waiting = load_weights(weights_path(campaign.folder, len(sets)), campaign.robot)
+            return WalkTuning(sets, waiting, "")
+    return WalkTuning(sets, None, tuning.reason)
 
 
-def read_record(campaign: Campaign) -> tuple[list[Row], Proposal | None]:
-    """Return the walks so far and the proposal that waits for its walk; begin a new record.
+def _remedy(campaign: Campaign) -> str:
+    """Return what to do with a folder of another campaign."""
+    anew = f" and begin anew with hector propose --start {campaign.folder}/weights/N.json"
+    return f"choose another folder{anew * campaign.reported}"
 
-    Those that were reported are scored as they were then: see `reported_walks.read_reports`.
 
-    Raises:
-        InputError: the folder holds the record of another campaign, or a damaged one.
-    """
-    size, engine, remedy = len(box_of(campaign)), campaign.engine, "choose another folder"
+def _head(campaign: Campaign) -> dict[str, Any]:
+    """Return what identifies a campaign, as JSON values."""
     head: dict[str, Any] = {
-        "format": 3,
-        "robot": robot_hash(campaign.robot),
+        "format": 4,
         "start": weights_tree(campaign.start),
-        "settings": content_key(campaign.config, campaign.start, code=()),
         "commands": {name: tree_hash(command) for name, command in campaign.commands.items()},
         "plants": [plant and tree_hash(plant) for plant in campaign.plants],
-        "seed": campaign.seed,
-        "leg_numbers": list(campaign.leg_numbers),
+        "numbers": list(campaign.config.others),
+        "seconds": campaign.seconds,
     }
     if campaign.reported:  # data: neither code nor loss can make them those of another campaign
-        settings = {"seconds": campaign.seconds, "numbers": list(campaign.numbers)}
-        head |= {"robot": walker_hash(campaign.robot), "settings": settings}
-        remedy += f" and begin anew with hector propose --start {campaign.folder}/weights/N.json"
-    else:
-        head |= {
-            "model": campaign.model,
-            "engine": engine.key,
-            "code": code_hash("walk_tuning.walks", *engine.modules),
-        }
-
-    def parse(row: Mapping[str, Any]) -> Any:  # a `Proposal`, or losses and margin of its walk
-        name, length = ("losses", len(campaign.cases)) if "losses" in row else ("point", size)
-        if (values := np.array(row[name], float)).shape != (length,):
-            raise ValueError(f"{name} of shape {values.shape}")
-        if name == "point":
-            return Proposal(values, row["method"], row["predicted"])
-        return np.where(np.isfinite(values), values, np.inf), float(row["margin"])
-
-    path = campaign.folder / RECORD
-    lines = continue_journal(path, head, "a tuning on walks", parse, remedy)
-    proposals, walked = lines[::2], lines[1::2]
-    if not all(isinstance(line, Proposal) == (i % 2 == 0) for i, line in enumerate(lines)):
-        raise InputError(f"{path}: a walk without a proposal, or a proposal without a walk")
-    rows = [Row(*proposal, *walk) for proposal, walk in zip(proposals, walked, strict=False)]
-    return rows, proposals[-1] if len(proposals) > len(walked) else None
+        return head | {"robot": walker_hash(campaign.robot)}
+    settings = replace(campaign.config, iterations=1)  # with a larger budget it goes on
+    return head | {
+        "robot": robot_hash(campaign.robot),
+        "settings": content_key(settings, campaign.start, code=()),
+        "engine": campaign.engine.key,
+        "code": code_hash("walk_tuning.walks", *campaign.engine.modules),
+    }
 
 
-def _walked(rows: Sequence[Row]) -> list[WalkResult]:
-    """Return the rows with the logarithm of their mean loss over the cases relative to the start.
-
-    It is infinite if the mean loss is not finite.
-    """
-    with np.errstate(invalid="ignore"):
-        ratios = [np.mean(row.losses / rows[0].losses) for row in rows]
-    losses = [float(np.log(ratio)) if np.isfinite(ratio) else np.inf for ratio in ratios]
-    return [WalkResult(*row[:3], L, row.margin) for row, L in zip(rows, losses, strict=True)]
-
-
-def next_proposal(
-    pool: Executor, campaign: Campaign, space: Space, rows: Sequence[Row]
-) -> tuple[Proposal, Weights]:
-    """Return the next proposal, saved in the folder; it stays the same until it is walked.
-
-    Raises:
-        InputError: the start fell, or packages of the extra `search` are missing.
-    """
-    if rows and not _stood(rows[0]):
-        raise InputError(
-            f"{campaign.folder}: the start fell or a QP was not solved; tune from another"
-        )
-    _, proposal = read_record(campaign)
-    if proposal is not None:
-        return proposal, weights_at(campaign, space, proposal.point)
-    history = _walked(rows)
-    has_model = campaign.model != "none" and few_walks.needs_model(history)
-    model = _model(pool, campaign, space, rows) if has_model else None
-    proposal = few_walks.propose(space, history, model, campaign.seed)
-    weights = weights_at(campaign, space, proposal.point)
-    save_weights(weights_path(campaign.folder, len(rows)), weights)
-    _add_proposal(campaign, proposal)
-    return proposal, weights
-
-
-def _add_proposal(campaign: Campaign, proposal: Proposal) -> None:
-    fields = {**proposal._asdict(), "point": proposal.point.tolist()}
-    add_row(campaign.folder / RECORD, fields)
+def walk_all(
+    pool: Executor, campaign: Campaign, number: int, weights: Weights
+) -> Sequence[ScoredLog]:
+    """Walk a set in all cases, and keep each walk in the folder as it ends."""
+    robot, paths = campaign.robot, log_paths(campaign, number)
+    empty = log_of(no_samples(len(robot.joint_lower), len(robot.foot_point)))
+    like = LogScore(0.0, 0.0), empty
+    missing = [case for case, path in enumerate(paths) if not path.exists()]
+    walked = pool.map(walk_case, repeat(campaign), repeat(weights), missing)
+    for case, scored in zip(missing, walked, strict=True):
+        save_tree(paths[case], scored, kind="log", robot=robot)
+    return [load_tree(path, like, kind="log", robot=robot)[0] for path in paths]
 
 
 def weights_path(folder: Path, number: int) -> Path:
-    """Return the file of the weights of a walk in the folder of a campaign."""
+    """Return the file of the weights of a set in the folder of a campaign."""
     return folder / "weights" / f"{number}.json"
 
 
 def log_paths(campaign: Campaign, number: int) -> list[Path]:
-    """Return the files of the logs of a walk, one for each case."""
+    """Return the files of the logs of a set, one for each case."""
     names = [f"{number}-{case}.npz" for case in range(len(campaign.cases))]
     return [campaign.folder / "logs" / name for name in names]
 
 
-def evaluate_logs(pool: Executor, campaign: Campaign, number: int) -> list[ScoredLog]:
-    """Evaluate the logs of a walk that was reported; see `evaluate_log`."""
-    config, robot, running = campaign.config, campaign.robot, []
-    for path, (_, command) in zip(log_paths(campaign, number), campaign.cases, strict=True):
-        log = read_log(path, robot, campaign.seconds, config.rollout.walk.gait.tick)
-        running.append(pool.submit(evaluate_log, config, robot, command, log))
-    return [job.result() for job in running]
-
-
-def _plan_logs(pool: Executor, campaign: Campaign, number: int) -> list[Log]:
-    """Return the logs of a walk at the plan interval."""
-    if campaign.reported:
-        return [log for _, log in evaluate_logs(pool, campaign, number)]
-    like = log_of(no_samples(len(campaign.robot.joint_lower), len(campaign.robot.foot_point)))
-    paths = log_paths(campaign, number)
-    return [load_tree(path, like, kind="log", robot=campaign.robot)[0] for path in paths]
-
-
-def _model(pool: Executor, campaign: Campaign, space: Space, rows: Sequence[Row]) -> Model:
-    """Return the model grounded on the best walk, or on all: see `Campaign.model`."""
-    numbers = [few_walks.best_walk(_walked(rows))]
-    if campaign.model == "every_walk":
-        numbers = [number for number, row in enumerate(rows) if _stood(row)]
-    walked = [(rows[number].point, _plan_logs(pool, campaign, number)) for number in numbers]
-    ratios = rows[numbers[0]].losses / rows[0].losses
-    return grounded_model.model_of(pool, campaign, space, walked, ratios)
-
-
-def add_walk(
-    campaign: Campaign, rows: Sequence[Row], proposal: Proposal, cases: Sequence[ScoredLog]
-) -> list[Row]:
-    """Append a walk to the history and save it in the folder: first its logs, then its line.
-
-    The logs of a walk that was reported are there already, and mostly its proposal.
-    """
-    if read_record(campaign)[1] is None:
-        _add_proposal(campaign, proposal)
-    if not campaign.reported:
-        for path, (_, log) in zip(log_paths(campaign, len(rows)), cases, strict=True):
-            save_tree(path, log, kind="log", robot=campaign.robot)
-    row = row_of(proposal, cases)
-    add_row(campaign.folder / RECORD, {"losses": row.losses.tolist(), "margin": row.margin})
-    return [*rows, row]
-
-
-def answer(campaign: Campaign, space: Space, rows: Sequence[Row]) -> tuple[Weights, int]:
-    """Return the best weights and the number of their walk; see `few_walks.incumbent`."""
-    number = few_walks.incumbent(space, _walked(rows))
-    return weights_at(campaign, space, rows[number].point), number
-
-
-def candidates(pool: Executor, campaign: Campaign, rows: Sequence[Row]) -> dict[str, Weights]:
-    """Return the start, each set that was 1 % better than all before it, and that of `answer`."""
-    space, history = campaign_space(pool, campaign), _walked(rows)
-    losses = np.array([result.loss for result in history])
-    better = losses[1:] < np.minimum.accumulate(losses)[:-1] - few_walks.GAIN
-    numbers = {0, *(1 + np.flatnonzero(better)), few_walks.incumbent(space, history)}
-    return {f"set {n}": weights_at(campaign, space, rows[n].point) for n in sorted(numbers)}
-
-
-def tune_on_walks(pool: Executor, campaign: Campaign, walks: int) -> list[Row]:
-    """Walk and tune on the plants of a campaign, from the walks in its folder on; return all rows.
-
-    Args:
-        pool: worker processes.
-        campaign: settings, all of whose plants are present.
-        walks: budget; whole rounds of all cases are walked, at least the start. If that falls,
-            nothing is tuned.
-
-    Raises:
-        InputError: see `next_proposal` and `read_record`.
-    """
-    space, cases = campaign_space(pool, campaign), len(campaign.cases)
-    rows, _ = read_record(campaign)
-    with bar(f"tuning with {plural(walks, 'walk')}") as report_progress:
-        while not rows or (_stood(rows[0]) and (len(rows) + 1) * cases <= walks):
-            report_progress(len(rows) * cases, walks, _progress(campaign, space, rows))
-            proposal, weights = next_proposal(pool, campaign, space, rows)
-            walked = list(pool.map(walk_case, repeat(campaign), repeat(weights), range(cases)))
-            rows = add_walk(campaign, rows, proposal, walked)
-        report_progress(len(rows) * cases, walks, _progress(campaign, space, rows))
-    if campaign.leg_numbers and all(row.method in ("start", "model") for row in rows):
-        say(f"{', '.join(campaign.leg_numbers)} were not moved: walks beyond the model are needed")
-    if not _stood(rows[0]):
-        say("the set from which to tune on walks fell, or a QP was not solved; it is kept as it is")
-    return rows
-
-
-def _stood(row: Row) -> bool:
-    """Tell whether no case fell and all QPs were solved."""
-    return bool(np.isfinite(row.losses).all())
-
-
-class Change(NamedTuple):
-    """Result of a proposal relative to the start."""
-
-    method: str
-    predicted: float | None  # [%] None where nothing was predicted
-    change: float | None  # [%] of L; None where the robot fell or a QP was not solved
-
-
-def changes_by_walk(rows: Sequence[Row]) -> list[Change]:
-    """Return the result of each proposal."""
-
-    def percent(loss: float | None) -> float | None:
-        return None if loss is None or np.isinf(loss) else 100.0 * float(np.expm1(loss))
-
-    return [Change(row.method, *map(percent, (row.predicted, row.loss))) for row in _walked(rows)]
-
-
-def _progress(campaign: Campaign, space: Space, rows: Sequence[Row]) -> str:
-    if not rows:
-        return "compiling"
-    best = few_walks.best_walk(_walked(rows))
-    change = f"best L {changes_by_walk(rows)[best].change or 0.0:+.0f} % against the start"
-    weights = weights_at(campaign, space, rows[best].point)
-    logs = np.asarray(steps_between(campaign.start, weights))
+def _progress(campaign: Campaign, sets: Sequence[WalkedSet]) -> str:
+    accepted = max((i for i, x in enumerate(sets) if x.accepted), default=0)
+    if not accepted:
+        return "the start has walked"
+    weights = sets[accepted].weights
+    logs = np.asarray(parameters.steps_between(campaign.start, weights))
     moved = sorted(zip(direction_names(weights), logs, strict=True), key=lambda x: -abs(x[1]))[:3]
     factors = ", ".join(f"{name} {np.exp(log):.2g} times" for name, log in moved)
-    return f"{change}; {factors}" if best else change
+    return f"L {changes(sets)[accepted] or 0.0:+.0f} % against the start; {factors}"
