@@ -24,7 +24,6 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Wrench
 from hector_jax.grfm.effect import last_command
 from hector_jax.tuning.difftune import (
-    LEAST_GAIN,
     TuneConfig,
     descend,
     init,
@@ -159,10 +158,12 @@ def test_it_stops_where_the_next_step_is_predicted_to_gain_too_little(share, end
     """Of the whole loss, of which no weight changes the largest part."""
     start = vector_to_weights(jnp.asarray(OPTIMUM * 1.1))
     gain = 1e6 * 24 * np.log(1.1) ** 2
-    found = tune_toy(quadratic(fixed=gain * (1.0 / (share * LEAST_GAIN) - 1.0)), start=start)
+    found = tune_toy(
+        quadratic(fixed=gain * (1.0 / (share * TuneConfig().least_gain) - 1.0)), start=start
+    )
     assert (len(found.iterations) == 1) == ended
     assert Stop(int(found.stop)) == Stop.NO_GAIN
-    assert found.reason.endswith("predicted to gain less than 0.5%")
+    assert found.reason.endswith("predicted to gain too little")
 
 
 def test_a_short_step_that_gains_little_is_no_convergence():

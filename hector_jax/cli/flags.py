@@ -184,7 +184,7 @@ class Tune(Configured, ByWalker, Parallel):
     variant: Variant = "residual"  # architecture of the net
     alpha: Literal["paper", "auto"] = "paper"  # loss weights; auto makes the gradient norms alike
     # price in `best` of changes of the command between switches of stance: more, smoother commands
-    smooth: Annotated[float, Range(0, 1000)] = 3.0
+    smooth: Annotated[float, Range(0, 1000)] = 5.0
     # limit [m] of the position error of `best`; by default 0.19 of the height of the centre of mass
     safe: Annotated[float | None, Range(0.001, 10)] = None
     data: Folder = Path("data")  # folder of the walks and the net, which are made if missing
@@ -194,9 +194,10 @@ class Tune(Configured, ByWalker, Parallel):
     resume: Annotated[Path | None, PathKind.RUN] = None  # interrupted run folder to continue
     video: bool = True  # make a film of the nominal and the best weights
     verdict: bool = False  # print up to 12 walks more: in other engines, or with other masses
-    # walks to spend on tuning row `best` further, on the walks themselves (docs/howto/walks.md)
-    walks: Annotated[int, Range(0, 100_000)] = 0
-    # drawn plants of these walks, 0 for the simulator; by default so that eight sets walk
+    # walks to spend on row `best` after its tuning on the model; 0 for none; by default three sets
+    # walk on eight drawn plants (docs/howto/walks.md)
+    walks: Annotated[int, Range(0, 100_000)] | None = None
+    # drawn plants of these walks, 0 for the simulator; by default so that eight sets can walk
     walk_plants: Annotated[int, Range(0, 1000)] | None = None
     walk_engine: WalkEngine = "c"  # of these walks; c: MuJoCo; extras: drake, pinocchio
     json: bool = False  # print JSON instead of the table; `run` is the folder

@@ -56,8 +56,7 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
             numbers that no gradient tunes; --net is not its net.
     """
     loaded = arguments.load_trajectories(args.traj, robot, "; add --each")
-    if args.walks:
-        choice.walk_plants(robot, args.walk_plants, args.walks, len(loaded))
+    choice.walk_plants(robot, args.walk_plants, args.walks, len(loaded))
     _check_walker(args)
     if args.net:
         load_trained(args.net, robot, args.variant)

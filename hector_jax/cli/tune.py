@@ -118,8 +118,7 @@ class _Tuned(NamedTuple):
     net: nets.TrainedNet
     tunings: dict[str, Tuning]
     sets: dict[str, Weights]
-    chosen: str  # "iteration 5", the one of its tuning that is `best`
-    walks: WalkTuning | None  # whose result is `best` in place of it; None without --walks
+    walks: WalkTuning | None  # whose result is `best`; None with --walks 0
 
 
 def _begin(pool: Executor, folder: Path, args: Tune) -> _Run:
@@ -180,7 +179,6 @@ def _tune_in(folder: Path, args: Tune) -> None:
         errors=net.errors,
         tunings=tuned.tunings,
         walks=tuned.walks,
-        chosen=tuned.chosen,
         smooth=args.smooth,
         draws=choice.DRAWS,
         **_draw(run, tuned, *walks[first.name]),
@@ -241,7 +239,6 @@ def _note_settings(run: _Run, net: nets.TrainedNet) -> dict[str, Any]:
         "command": commands[0] if len(commands) == 1 else commands,
         "seconds": run.seconds,
         "start": weights_tree(run.start),
-        "choice_plants": run.setup.robot.description.tuning.choice_plants,
     }
     return run_folder.note_settings(run.folder, settings)
 
@@ -259,24 +256,19 @@ def _tune_sets(run: _Run, net: nets.TrainedNet) -> _Tuned:
     problem = {"best": problems["with"]._replace(draws=choice.DRAWS)}
     of_best = setup._replace(config=config)
     done |= tune_in(of_best, problem, title=title, start=start, before=done)
-    options = {"seconds": run.seconds, "folder": folder / "choice"}
-    points, plants = choice.points_of(done["best"]), setup.robot.description.tuning.choice_plants
-    chosen = choice.walks_best(setup, points, commands, plants, **options)
     sets = {
         "nominal": nominal(setup.robot),
         "expert": expert(setup.robot),
         **({} if run.args.start in BASELINES else {"start": run.start}),
         **{name: tuning.weights for name, tuning in done.items()},
-        "best": points[chosen],
     }
     _save_sets(run, sets)  # a tuning on walks may be long: what there is can be used meanwhile
-    walks = None
-    if run.args.walks:
-        sets["before_walks"] = sets["best"]
-        walks = tune_on_walks(setup.pool, _campaign(run, sets["best"]), walks=run.args.walks)
+    campaign, budget = _campaign(run, sets["best"])
+    walks = tune_on_walks(setup.pool, campaign, walks=budget) if budget else None
+    if walks:
         sets["best"] = walks.sets[walks.best].weights
         _save_sets(run, sets)
-    return _Tuned(net, done, sets, chosen, walks)
+    return _Tuned(net, done, sets, walks)
 
 
 def _save_sets(run: _Run, sets: Mapping[str, Weights]) -> None:
@@ -285,12 +277,13 @@ def _save_sets(run: _Run, sets: Mapping[str, Weights]) -> None:
         save_weights(run.folder / "weights" / f"{name}.json", weights)
 
 
-def _campaign(run: _Run, start: Weights) -> Campaign:
-    """Return the settings of the tuning on the walks of --walks, from the result of the tunings."""
+def _campaign(run: _Run, start: Weights) -> tuple[Campaign, int]:
+    """Return the tuning of `best` on walks, from the result of that on the model; its budget."""
     robot, args, (config, _) = run.setup.robot, run.args, run.settings_of_best
-    plants = choice.walk_plants(robot, args.walk_plants, args.walks, len(run.commands))
+    plants, budget = choice.walk_plants(robot, args.walk_plants, args.walks, len(run.commands))
+    config = replace(config, least_gain=choice.WALK_GAIN)
     inputs = run.folder / "walks", config, robot, start, run.commands, plants
-    return Campaign(*inputs, arguments.engine_of(args))
+    return Campaign(*inputs, arguments.engine_of(args)), budget
 
 
 def _walk_sets(
@@ -349,7 +342,6 @@ def _result(
         result["trajectories"] = {name: content([name], by_name[name]) for name in names}
     if tuned.walks:
         result["walks"] = tuned.walks.rows
-    result["chosen"] = tuned.chosen
     directions = [direction._asdict() for direction in known.directions]
     result["determined"] = {"directions": directions, "weights": known.weights}
     write_json(run.folder / RESULT, result)

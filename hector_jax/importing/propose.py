@@ -24,7 +24,6 @@ of mass m and height h:
     lead                     one gait cycle in place before the command of a rollout
     touchdown_error          true: heavy legs miss the planned touchdown by some centimetres
     estimate_noise, delay    1, 0.005 s: without them a tuning takes gains that shake the robot
-    choice_plants            4: tuning can improve the model's walk and worsen the robot's
     joint_friction, _damping times m h / (m0 h0); push, payload: m / m0; trunk_com: h / h0
     min_height               0.55 h
 """
@@ -225,7 +224,6 @@ def _settings(robot: Robot) -> dict[str, Any]:
             "touchdown_error": True,
             "estimate_noise": 1,
             "delay": 0.005,
-            "choice_plants": 4,
         },
         "plants": {
             "joint_friction": torque,

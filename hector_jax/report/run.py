@@ -27,8 +27,7 @@ def write_run_report(folder: Path, **contents: Any) -> Path:
             norms: gradient norms of the terms in log-weights at nominal, by model.
             determined: what the tuning `with` knows about its weights.
             errors: held-out errors of `raw`, `linear`, `net`, from `training.errors_by_phi`.
-            walks: the `WalkTuning` that made `best`; None without --walks.
-            chosen: name of the iteration that is `best`.
+            walks: the `WalkTuning` that made `best`; None with --walks 0.
             smooth: price of changes of the command between switches of stance in `best`.
             draws: variations of the model for each trajectory of `best`.
             pictures, film: list of `Picture`; `Picture` of the film, or why there is none.
@@ -48,7 +47,6 @@ def write_run_report(folder: Path, **contents: Any) -> Path:
 def tuning_section(
     name: str,
     tuning: Tuning,
-    chosen: str = "",
     where: str = "on the model",
 ) -> str:
     """Return the section of a tuning.
@@ -56,10 +54,9 @@ def tuning_section(
     Args:
         name: of the set.
         tuning: with its history.
-        chosen: name of the iteration that was taken; empty for the last.
         where: the loss was computed, in words.
     """
-    values = {"name": name, "tuning": tuning, "chosen": chosen, "where": where}
+    values = {"name": name, "tuning": tuning, "where": where}
     return render("tuning.md.j2", **values, refusals=_refusals, at_bounds=_at_bounds)
 
 

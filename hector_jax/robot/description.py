@@ -27,7 +27,7 @@ and torque limits come from the model; a description is a static field of its `R
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -96,9 +96,6 @@ class TuningSettings:
     touchdown_error: bool = False  # the net learns the distance from planned to actual touchdown
     estimate_noise: Annotated[float, NOT_NEGATIVE] = 0.0  # factor on that of a real robot's sensors
     delay: Annotated[float, NOT_NEGATIVE] = 0.0  # [s] of the ground's reaction, at most a tick
-    # plants to choose the iteration, 0: the last; not in the repr, which is hashed to identify a
-    # robot: no stored walk, net or tuning depends on it
-    choice_plants: Annotated[int, NOT_NEGATIVE] = field(default=0, repr=False)
 
     def __post_init__(self) -> None:
         check(self)

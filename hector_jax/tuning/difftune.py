@@ -41,8 +41,6 @@ from hector_jax.tuning.rollout import RolloutConfig, Scenario
 from hector_jax.tuning.status import StepStatus, Stop, status_text
 from hector_jax.tuning.step_rules import StepState
 
-LEAST_GAIN = 5e-3
-"""Share of the objective that a Gauss-Newton step of one e-fold must be predicted to gain."""
 SMALLEST_STEP = 1 / 128
 """Share of the full gradient step below which a tuning ends."""
 SMALLEST_REGION = 1 / 100
@@ -59,6 +57,8 @@ class TuneConfig:
     rule: str = "gauss_newton"  # or the paper's: "relative", "literal" (theta - beta dL/dtheta)
     # of "gauss_newton": share of the loss at the start, for e-folds of |z|^2 = 2
     ridge: Annotated[float, NOT_NEGATIVE] = 0.003
+    # share of the objective that a step of one e-fold must be predicted to gain
+    least_gain: Annotated[float, NOT_NEGATIVE] = 5e-3
     # of the paper's rules: largest relative step of a weight in Q, in R
     beta_q: Annotated[float, POSITIVE] = 0.05
     beta_r: Annotated[float, POSITIVE] = 0.08
@@ -156,7 +156,7 @@ class Tuning(NamedTuple):
             Stop.GOING: "not ended",
             Stop.LIMIT: plural(len(self.history.iteration) - 1, "iteration"),
             Stop.SMALL_STEP: "the step became too small to gain",
-            Stop.NO_GAIN: f"a step of one e-fold was predicted to gain less than {LEAST_GAIN:.1%}",
+            Stop.NO_GAIN: "a step of one e-fold was predicted to gain too little",
             Stop.BAD_START: "the starting weights were refused",
         }[Stop(int(self.stop))]
 
@@ -257,7 +257,9 @@ def update(
     if config.rule == "gauss_newton":
         step = step_rules.boxed_step(config.ridge, after, box, 1.0)
         gain = step_rules.predicted_gain(config.ridge, after, after.steps + step)
-        least = LEAST_GAIN * step_rules.objective(config.ridge, after, after.steps, after.value)
+        least = config.least_gain * step_rules.objective(
+            config.ridge, after, after.steps, after.value
+        )
         stop = jnp.where(after.size < SMALLEST_REGION, Stop.SMALL_STEP, stop)
         stop = jnp.where(~(gain >= least), Stop.NO_GAIN, stop)
     else:
