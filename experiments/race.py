@@ -1,4 +1,4 @@
-"""Is the tuner on walks ahead of what sees one number of each walk? The race.
+"""Is a tuning on walks ahead of what sees one number of each walk? The race.
 
 `tune_on_walks` against the optimizers of `rivals.py`, on one trajectory of the high-fidelity
 simulator, from nominal; the walk of the start is the first of each. That simulator has no chance in

@@ -6,6 +6,7 @@ from functools import partial
 import many_plants
 import numpy as np
 import pytest
+import race
 from rivals import RIVALS, Task, search
 
 from hector_jax.control.reference import named_command
@@ -38,6 +39,12 @@ def test_a_fall_is_worse_than_all_walks_before_it():
     falls = np.flatnonzero(seen[:, 0] < 0.0)
     assert len(falls) > 5
     assert [losses[fall] for fall in falls] == [losses[:fall].max() + 1.0 for fall in falls]
+
+
+def test_the_best_so_far_passes_over_falls_and_the_end_of_a_rival():
+    losses = np.array([[6.0, np.inf, 5.0, 7.0, 4.0], [6.0, 5.0, 3.0, np.nan, np.nan]])
+    own = {1: [6.0, 6.0], 2: [6.0, 5.0], 5: [4.0, 3.0]}
+    assert race.entry(losses) == {"own": own, "falls": [1, 0]}
 
 
 def test_a_search_over_plants_that_was_cut_ends_as_if_it_had_not_been(monkeypatch, tmp_path):
