@@ -1,9 +1,9 @@
 """How low can one weight set go on many plants? A search with thousands of walks.
 
 CMA-ES over the mean loss on several plants of `hfs-varied` and all three commands at once, from
-`best` or another start, in the metric of the model. Its answer is the mean of the last
-distribution. It walks on the plants of the search and on as many others: what it gains on the
-former alone is fitted to them.
+`best` or another start, in the steps of the tuner (`parameters.stepped`). Its answer is the mean of
+the last distribution. It walks on the plants of the search and on as many others: what it gains on
+the former alone is fitted to them.
 
     python experiments/many_plants.py --tune weights
     python experiments/many_plants.py --tune all --generations 40
@@ -26,7 +26,7 @@ import tyro
 from jaxtyping import Float
 from lib import write_report
 
-from hector_jax.control.parameters import leg_numbers, model_numbers
+from hector_jax.control.parameters import step_bounds, tunables, weights_after
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import best, load_weights, save_weights, weights_tree
@@ -51,8 +51,7 @@ from hector_jax.store.cache import content_key, robot_hash
 from hector_jax.store.setup import Setup
 from hector_jax.tuning.loss import loss_of
 from hector_jax.verdict import judging, metrics
-from hector_jax.walk_tuning.campaign import Campaign, box_of, weights_at
-from hector_jax.walk_tuning.walks import campaign_space
+from hector_jax.walk_tuning.campaign import Campaign
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ class Flags:
     first_plant: int = 100  # seed of the first one
     generations: int = 30
     population: int = 16  # weight sets in a generation
-    spread: float = 0.3  # first standard deviation, in the metric of the model
+    spread: float = 0.3  # first standard deviation: e-folds, shares of a box
     seed: int = 0
     engine: str = "auto"  # c (MuJoCo, on the processes), mjx (all at once), auto: mjx on a GPU
     out: Path = Path("runs/many-plants")  # folder of the reports
@@ -118,13 +117,19 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
         "settings": content_key(campaign.config, campaign.start, code=()),
         "engine": engine.key,
         "physics_bits": engine.bits(False),
-        "numbers": list(campaign.numbers),
+        "numbers": list(campaign.config.others),
         "start": weights_tree(campaign.start),
         "plants": [tree_hash(plant) for plant in campaign.plants],
         "code": [code_hash("walk_tuning.walks", *engine.modules), function_id(search)],
         **{name: getattr(flags, name) for name in ("population", "spread", "seed")},
     }
-    size, dimensions = flags.population, len(box_of(campaign))
+    others = campaign.config.others
+    lower, upper = map(np.asarray, step_bounds(campaign.start, others))
+    size, dimensions = flags.population, len(lower)
+
+    def weights_at(steps: Float[np.ndarray, " d"]) -> Weights:
+        clipped = np.clip(steps, lower, upper)
+        return jax.device_get(weights_after(campaign.start, clipped, others))
 
     def parse(row: dict[str, list]) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]:
         steps, losses = np.array(row["steps"], float), np.array(row["losses"], float)
@@ -133,10 +138,7 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
         return steps, np.where(np.isfinite(losses), losses, np.inf)  # null in the journal
 
     path = campaign.folder / "generations.jsonl"
-    rows, space = (
-        continue_journal(path, head, "a search", parse),
-        campaign_space(pool, campaign),
-    )
+    rows = continue_journal(path, head, "a search", parse)
     losses = partial(losses_of, pool, campaign, engine, batch=size * len(campaign.cases))
     at_start = next(losses([campaign.start]))
     if not np.isfinite(at_start).all():
@@ -146,8 +148,7 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
         for number in range(flags.generations):
             points = np.stack([evolution.ask() for _ in range(size)])
             if number == len(rows):
-                sets = [weights_at(campaign, space, space.clip(point)) for point in points]
-                means = [float(np.mean(x / at_start)) for x in losses(sets)]
+                means = [float(np.mean(x / at_start)) for x in losses([*map(weights_at, points)])]
                 row = {"steps": points.tolist(), "losses": means}
                 rows.append(parse(row))
                 add_row(path, row)
@@ -156,7 +157,7 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
             evolution.tell(list(zip(steps, ratios.tolist(), strict=True)))
             remark = f"mean L against the start {np.median(ratios):.3f}"
             report_progress(number + 1, flags.generations, remark)
-    return weights_at(campaign, space, space.clip(evolution.mean))
+    return weights_at(evolution.mean)
 
 
 def main() -> None:
@@ -165,14 +166,13 @@ def main() -> None:
     setup_jax()
     robot, engine = jax.tree.map(np.asarray, load_robot(flags.robot)), choose_engine(flags.engine)
     start = best(robot) if flags.start is None else load_weights(flags.start, robot)
-    config = tunings.tune_config(robot, others=model_numbers(flags.tune))
+    config = tunings.tune_config(robot, others=tunables(flags.tune))
     commands = {name: named_command(name) for name in COMMANDS}
     folder, count, first = flags.out / "-".join(flags.tune), flags.plants, flags.first_plant
     make_folder(folder)
     seeds = range(first, first + 2 * count)
     plants = [named_world("hfs-varied", seed, robot.description) for seed in seeds]
-    inputs = folder, config, robot, start, commands, plants[:count]
-    campaign = Campaign(*inputs, leg_numbers=leg_numbers(flags.tune))
+    campaign = Campaign(folder, config, robot, start, commands, plants[:count])
     with workers(flags.processes) as pool:
         answer = search(pool, campaign, engine, flags)
         save_weights(folder / "weights.json", answer)

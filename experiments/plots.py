@@ -88,12 +88,12 @@ def race(path: Path, curves: Mapping[str, Mapping[int, Sequence[float]]]) -> str
         for i, (name, by_budget) in enumerate(curves.items()):
             walks, losses = np.array(list(by_budget)), np.array(list(by_budget.values())) / 1e6
             color, dashes = f"C{i % 10}", ("-", "--", ":")[i // 10 % 3]
-            axes.plot(walks + 1, np.median(losses, axis=1), dashes, color=color, label=name)
+            axes.plot(walks, np.median(losses, axis=1), dashes, color=color, label=name)
             bounds = losses.min(axis=1), losses.max(axis=1)
-            axes.fill_between(walks + 1, *bounds, color=color, alpha=0.1, linewidth=0)
+            axes.fill_between(walks, *bounds, color=color, alpha=0.1, linewidth=0)
         axes.set(xlabel="walks", ylabel="L of the best set so far [10$^6$]", xscale="log")
         counts = max(curves.values(), key=len)
-        axes.set_xticks([1 + count for count in counts], [str(count) for count in counts])
+        axes.set_xticks([*counts], [*map(str, counts)])
         axes.minorticks_off()
         log_axis(axes, "y")
     return "L of the best set so far by walks: median of the repeats, and their range."

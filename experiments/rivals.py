@@ -1,13 +1,13 @@
-"""Rivals of `hector tune --walks`: optimizers of a weight set that see one number of each walk.
+"""Rivals of the tuner on walks: optimizers of a weight set that see one number of each walk.
 
 A rival is a function of a `Task`. It walks points until the budget is spent (`Spent`) or it has
 converged, with the settings of its library or its tutorial, but for the first points of TuRBO,
-which are drawn about the start. The coordinates are steps of the log-weights, or the metric of the
-model; the rival cannot tell.
+which are drawn about the start. The coordinates are steps of the log-weights from the start.
 """
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ from hector_jax.core.inputs import require_package
 
 _FIRST_DRAWS = 10  # walks before the first Gaussian process
 _STEP = math.log(1.05)  # of finite differences
-_SOURCES = 300  # most walks of the model that the prior mean of a Gaussian process is fitted to
+_SOURCES = 300  # walks of the model that the prior mean of a Gaussian process is fitted to
 
 
 class Spent(Exception):  # noqa: N818, the end of a budget is no error
@@ -27,17 +27,34 @@ class Spent(Exception):  # noqa: N818, the end of a budget is no error
 
 
 class Task(NamedTuple):
-    """What a rival is given."""
+    """What a rival is given. The start is the origin, with log-loss zero: it has walked."""
 
     walk: Callable[[Float[np.ndarray, " n"]], float]  # log-loss of a point; raises Spent
-    box: Float[np.ndarray, "n 2"]  # of the points; the start is the origin
+    model: Callable[[Float[np.ndarray, " n"]], float]  # its log-loss on the model, which is free
+    box: Float[np.ndarray, "n 2"]  # of the points
     spread: float  # first standard deviation
     seed: int
-    source: tuple[Float[np.ndarray, "m n"], Float[np.ndarray, " m"]]  # points, log-losses: model
 
     def draw(self, rng: np.random.Generator) -> Float[np.ndarray, " n"]:
         """Draw a point about the start."""
         return np.clip(self.spread * rng.standard_normal(len(self.box)), *self.box.T)
+
+
+def search(rival: Callable[[Task], None], task: Task, budget: int) -> tuple[np.ndarray, np.ndarray]:
+    """Run a rival on a budget of walks, the start's included; return its points and log-losses."""
+    points, losses = [np.zeros(len(task.box))], [0.0]
+
+    def walk(point: Float[np.ndarray, " n"]) -> float:
+        if len(points) == budget:
+            raise Spent
+        loss = task.walk(point)
+        points.append(point)
+        losses.append(loss if np.isfinite(loss) else max(losses) + 1.0)  # a fall is the worst yet
+        return losses[-1]
+
+    with suppress(Spent):
+        rival(task._replace(walk=walk))
+    return np.array(points), np.array(losses)
 
 
 def random(task: Task) -> None:
@@ -49,26 +66,10 @@ def random(task: Task) -> None:
 
 def cma_es(task: Task) -> None:
     """Run CMA-ES with the population of its library."""
-    _evolve(task, mean=np.zeros(len(task.box)), sigma=task.spread)
-
-
-def warm_cma_es(task: Task) -> None:
-    """Run CMA-ES from a distribution of the best tenth of the model's points.
-
-    Source: Nomura et al., "Warm starting CMA-ES for hyperparameter optimization", AAAI 2021.
-    """
-    require_package("cmaes", "race", "the race")
-    from cmaes import get_warm_start_mgd
-
-    mean, sigma, covariance = get_warm_start_mgd(list(zip(*task.source, strict=True)))
-    _evolve(task, mean=np.clip(mean, *task.box.T), sigma=sigma, cov=covariance)
-
-
-def _evolve(task: Task, **first: Any) -> None:
     require_package("cmaes", "race", "the race")
     from cmaes import CMA
 
-    evolution = CMA(**first, bounds=task.box, seed=task.seed)
+    evolution = CMA(np.zeros(len(task.box)), task.spread, bounds=task.box, seed=task.seed)
     while not evolution.should_stop():
         points = [evolution.ask() for _ in range(evolution.population_size)]
         evolution.tell([(point, task.walk(point)) for point in points])
@@ -88,7 +89,7 @@ def lq_cma_es(task: Task) -> None:
 
 def differences(task: Task) -> None:
     """Descend along forward differences; a step that raises the loss is halved."""
-    rate, loss, at = 4.0 * task.spread, task.walk(np.zeros(len(task.box))), np.zeros(len(task.box))
+    rate, loss, at = 4.0 * task.spread, 0.0, np.zeros(len(task.box))
     while rate > 1e-3:
         offsets = np.where(at + _STEP > task.box[:, 1], -_STEP, _STEP)
         slopes = [(task.walk(point) - loss) / _STEP for point in at + np.diag(offsets)]
@@ -106,7 +107,7 @@ def turbo(task: Task, *, with_model: bool = False) -> None:
 
     Args:
         task: see `Task`.
-        with_model: the prior mean is a Gaussian process fitted to the model's points.
+        with_model: the prior mean is a Gaussian process fitted to a search on the model.
 
     Source: Eriksson et al., "Scalable global optimization via local Bayesian optimization",
     NeurIPS 2019.
@@ -120,11 +121,11 @@ def turbo(task: Task, *, with_model: bool = False) -> None:
     to_cube = lambda points: torch.tensor((np.asarray(points) - low) / (high - low))  # noqa: E731
     prior_mean = lambda points: torch.zeros(len(points), dtype=torch.double)  # noqa: E731
     if with_model:
-        some = rng.permutation(len(task.source[1]))[:_SOURCES]
-        prior = _fitted(to_cube(task.source[0][some]), torch.tensor(-task.source[1][some]))
+        seen, values = search(cma_es, task._replace(walk=task.model), _SOURCES)
+        prior = _fitted(to_cube(seen), torch.tensor(-values))
         prior_mean = lambda points: _mean(prior, points)  # noqa: E731
     points = [np.zeros(size), *(task.draw(rng) for _ in range(_FIRST_DRAWS - 1))]
-    losses = [task.walk(point) for point in points]
+    losses = [0.0, *map(task.walk, points[1:])]
     length, successes, failures = 0.8, 0, 0
     while length > 0.5**7:
         x, y = to_cube(points), -torch.tensor(losses)
@@ -179,14 +180,9 @@ def _fitted(points: Any, values: Any, **parts: Any) -> Any:
 
 RIVALS: dict[str, Callable[[Task], None]] = {
     "cma-es": cma_es,
-    "warm cma-es": warm_cma_es,
     "lq-cma-es": lq_cma_es,
     "turbo": turbo,
     "turbo on model": partial(turbo, with_model=True),
     "differences": differences,
     "random": random,
 }
-READ_START = ("turbo", "turbo on model", "differences")
-"""Rivals that need the walk of the start."""
-LEARN = ("warm cma-es", "turbo on model")
-"""Rivals that learn from searches on the model."""

@@ -17,8 +17,8 @@ FLOOR = {room: height for height, room in enumerate([*METHOD, *APPLICATION])}
 DOORS = {"mujoco": ("core.headless", "sim.mjx_model"), "pydrake": ("sim.drake",)}
 DOORS |= {"pinocchio": ("sim.pinocchio",), "coal": ("sim.pinocchio",)}
 DOORS |= {"viser": ("report.view",), "trimesh": ("report.view",), "flax": ("grfm.nets",)}
-DOORS |= {"optax": ("grfm.nets", "tuning.difftune", "tuning.step_rules", "search.few_walks")}
-DOORS |= {"jaxopt": ("qp.jaxopt_solver",), "tinygp": ("search.few_walks",)}
+DOORS |= {"optax": ("grfm.nets", "tuning.difftune", "tuning.step_rules")}
+DOORS |= {"jaxopt": ("qp.jaxopt_solver",)}
 DOORS |= {
     "matplotlib": ("report.plots",),
     "jinja2": ("report.report", "export.source", "export.template"),

@@ -237,7 +237,7 @@ def test_the_doctor_reports_what_works_and_what_does_not(monkeypatch, capsys):
     assert told["precision"] == "float64"
     assert told["robot"].startswith(str(MODEL_PATH))
     assert {"python", "jax", "mujoco", "devices", "cache", "extras", "video"} <= told.keys()
-    assert "search: yes (for hector tune --walks and propose)" in told["extras"]
+    assert "view: yes (for hector view)" in told["extras"]
     assert call(monkeypatch, "doctor") == 0  # without --json the same lines
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(told)
 

@@ -6,37 +6,45 @@ from functools import partial
 import many_plants
 import numpy as np
 import pytest
-from rivals import RIVALS, Spent, Task
+import race
+from rivals import RIVALS, Task, search
 
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import nominal
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.model import load_robot
-from hector_jax.search.few_walks import Space
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.walk_tuning.campaign import Campaign, box_of
+from hector_jax.walk_tuning.campaign import Campaign
 
 BOX = np.array([[-3.0, 1.0]] * 6)
 GOAL = np.linspace(-2.0, 2.0, 6)  # partly beyond the box
 
 
+def bowl(point):
+    return np.sum((point - GOAL) ** 2) - np.sum(GOAL**2)
+
+
 def test_cma_es_goes_downhill_inside_the_box():
-    points = []
-
-    def walk(point):
-        if len(points) == 600:
-            raise Spent
-        points.append(point)
-        return np.sum((point - GOAL) ** 2)
-
-    nothing = np.zeros((0, 6)), np.zeros(0)
-    with pytest.raises(Spent):
-        RIVALS["cma-es"](Task(walk, BOX, 1.0, 3, nothing))
-    seen = np.array(points)
+    seen, losses = search(RIVALS["cma-es"], Task(bowl, bowl, BOX, 1.0, 3), 600)
+    assert len(seen) == len(losses) == 600
     assert ((BOX[:, 0] <= seen) & (seen <= BOX[:, 1])).all()
     np.testing.assert_allclose(seen[-1], np.clip(GOAL, *BOX.T), atol=0.1)
+
+
+def test_a_fall_is_worse_than_all_walks_before_it():
+    falling = lambda point: np.inf if point[0] < 0.0 else bowl(point)  # noqa: E731
+    seen, losses = search(RIVALS["random"], Task(falling, bowl, BOX, 1.0, 3), 20)
+    falls = np.flatnonzero(seen[:, 0] < 0.0)
+    assert len(falls) > 5
+    assert [losses[fall] for fall in falls] == [losses[:fall].max() + 1.0 for fall in falls]
+
+
+def test_the_best_so_far_passes_over_falls_and_the_end_of_a_rival():
+    losses = np.array([[6.0, np.inf, 5.0, 7.0, 4.0], [6.0, 5.0, 3.0, np.nan, np.nan]])
+    own = {1: [6.0, 6.0], 2: [6.0, 5.0], 5: [4.0, 3.0]}
+    assert race.entry(losses) == {"own": own, "falls": [1, 0]}
 
 
 def test_a_search_over_plants_that_was_cut_ends_as_if_it_had_not_been(monkeypatch, tmp_path):
@@ -50,10 +58,7 @@ def test_a_search_over_plants_that_was_cut_ends_as_if_it_had_not_been(monkeypatc
             loss = 1.0 + np.log(weights.Q.euler[0] / campaign.start.Q.euler[0] / 2.0) ** 2
             yield np.array([loss if loss < 1.6 else np.inf])  # a QP that was not solved
 
-    box = box_of(campaign)
-    space = Space(np.eye(len(box)), np.eye(len(box)), np.ones(len(box)), box)
     monkeypatch.setattr(many_plants, "losses_of", losses_of)
-    monkeypatch.setattr(many_plants, "campaign_space", lambda *_: space)
     flags = many_plants.Flags(generations=12, population=8)
     search = partial(many_plants.search, None, campaign, MUJOCO_C)
     whole, path = search(flags), tmp_path / "generations.jsonl"

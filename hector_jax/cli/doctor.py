@@ -33,7 +33,6 @@ from hector_jax.verdict.judging import walk_rigid_body
 _EXTRAS = {  # name: (packages that it needs, what needs it)
     "cluster": (("distributed",), "--cluster"),
     "race": (("botorch", "cma", "cmaes"), "experiments/race.py"),
-    "search": (("tinygp",), "hector tune --walks and propose"),
     "view": (("viser",), "hector view"),
 }
 

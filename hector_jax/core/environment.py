@@ -32,7 +32,7 @@ _PACKAGES_OF = {
 }
 _NO_NUMBER_PACKAGES = ("jaxtyping", "msgspec")  # of types and files
 _PACKAGES = (
-    "hector-jax jax jaxlib jaxopt flax optax numpy scipy mujoco mujoco-mjx tinygp drake pin"
+    "hector-jax jax jaxlib jaxopt flax optax numpy scipy mujoco mujoco-mjx drake pin"
 ).split()
 _ROOT = Path(__file__).parents[1]
 
