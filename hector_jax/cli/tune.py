@@ -265,7 +265,9 @@ def _tune_sets(run: _Run, net: nets.TrainedNet) -> _Tuned:
     _save_sets(run, sets)  # a tuning on walks may be long: what there is can be used meanwhile
     campaign, budget = _campaign(run, sets["best"])
     walks = tune_on_walks(setup.pool, campaign, walks=budget) if budget else None
-    if walks:
+    if walks and not walks.sets[0].accepted:
+        say(f"`best` stays as the model has it: {walks.reason}")
+    elif walks:
         sets["best"] = walks.sets[walks.best].weights
         _save_sets(run, sets)
     return _Tuned(net, done, sets, walks)

@@ -125,6 +125,8 @@ def tune_walker(folder: Path, args: Tune) -> None:
     _check_first(args, campaign, seconds)
     with workers(args.processes, args.cluster) as pool:
         tuned = tune_on_walks(pool, campaign, walks=args.walks)
+        if not tuned.sets[0].accepted:
+            raise InputError(f"--start {args.start}: {tuned.reason}; tune from another")
         compared = {"start": campaign.start, "best": tuned.sets[tuned.best].weights}
         setup = Setup(pool, config, robot)
         options = {"seconds": seconds, "folder": folder / "scores", "engine": campaign.engine}

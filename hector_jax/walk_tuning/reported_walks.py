@@ -48,12 +48,15 @@ def read_reports(pool: Executor, campaign: Campaign) -> Reports:
     """Return the walks so far, scored by the present code; begin the record if it is new.
 
     Raises:
-        InputError: see `walks.tune_on_walks`; or the weights or a log of a walk are damaged.
+        InputError: see `walks.tune_on_walks`; the weights or a log of a walk are damaged; or the
+            start fell.
     """
     campaign = replace(campaign, config=replace(campaign.config, iterations=_MOST))
     ask = partial(_scored, pool, campaign)
     tuning = walks.tune_on_walks(pool, campaign, ask)
     number = len(tuning.sets)
+    if number and not tuning.sets[0].accepted:
+        raise InputError(f"{campaign.folder}: {tuning.reason}; tune from another")
     if tuning.waiting is not None:
         return Reports(tuning, tuning.waiting, number, None)
     best, again = tuning.sets[tuning.best], []

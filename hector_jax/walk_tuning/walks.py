@@ -31,7 +31,7 @@ from hector_jax.control.weights import Weights, direction_names
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.console import bar
 from hector_jax.core.environment import code_hash
-from hector_jax.core.inputs import plural
+from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.journal import continue_journal, write_rows
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
@@ -91,7 +91,8 @@ class WalkTuning(NamedTuple):
     def best(self) -> int:
         """Number of the last accepted set that falls in no more cases than the start."""
         most = self.sets[0].fell.sum()
-        return max(i for i, x in enumerate(self.sets) if x.accepted and x.fell.sum() <= most)
+        steps = (i for i, x in enumerate(self.sets) if x.accepted and x.fell.sum() <= most)
+        return max(steps, default=0)
 
 
 class Waiting(Exception):  # noqa: N818
@@ -216,9 +217,11 @@ def tune_on_walks(
         ask: makes the walks of a set; by default the engine of the campaign does.
         walks: budget; whole sets walk in all cases. None: the iterations of the settings.
 
+    Returns:
+        The sets; if the start falls in all cases it alone.
+
     Raises:
-        InputError: the folder holds the record of another campaign, or a damaged one; or the start
-            falls in all cases.
+        InputError: the folder holds the record of another campaign, or a damaged one.
     """
     head = _head(campaign)
     continue_journal(campaign.folder / RECORD, head, "a tuning on walks", dict, _remedy(campaign))
@@ -243,6 +246,10 @@ def tune_on_walks(
         except Waiting:
             waiting = load_weights(weights_path(campaign.folder, len(sets)), campaign.robot)
             return WalkTuning(sets, waiting, "")
+        except InputError:
+            if sets and not sets[0].accepted:
+                return WalkTuning(sets, None, "the start fell or was not solved in all walks")
+            raise
     return WalkTuning(sets, None, tuning.reason)
 
 
