@@ -128,10 +128,10 @@ def matrix(
         return ravel_pytree(stepped(weights, steps, others))[0]
 
     def rows(state: State, command: Wrench) -> Float[jax.Array, " rows"]:
-        return residuals(loss, trajectory._replace(state=state, command=command))
+        return jnp.asarray(residuals(loss, trajectory._replace(state=state, command=command)))
 
     by_steps = jax.jacobian(moved)(jnp.zeros(len(step_names(weights, others))))
     at = trajectory.state, trajectory.command
     along = jax.vmap(lambda *tangent: jax.jvp(rows, at, tangent)[1])
     J = along(sensitivities.state, sensitivities.command).T @ by_steps
-    return 2.0 * J.T @ J
+    return jnp.asarray(2.0 * J.T @ J)
