@@ -452,3 +452,13 @@ def test_a_record_or_a_log_that_is_damaged_is_refused_in_one_line(toy):
     record.write_text("\n".join([lines[0], "{", ""]))
     with pytest.raises(InputError, match=r"walks.jsonl, line 2: a row of a tuning on walks"):
         walks.tune_on_walks(Here(), one, walks=6)
+
+
+def test_weights_in_the_folder_that_have_other_numbers_are_refused_in_one_line(toy):
+    walks.tune_on_walks(Here(), one := toy(), walks=6)
+    path = walks.weights_path(one.folder, 1)
+    wide = load_weights(path)._replace(others={"footstep_width": np.array(0.07)})
+    save_weights(path, wide)
+    words = "1.json: others must be those of the start, none; got footstep_width"
+    with pytest.raises(InputError, match=words):
+        walks.tune_on_walks(Here(), one, walks=6)

@@ -31,7 +31,7 @@ from hector_jax.control.weights import Weights, direction_names
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.console import bar
 from hector_jax.core.environment import code_hash
-from hector_jax.core.inputs import plural
+from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.journal import continue_journal, write_rows
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
@@ -156,6 +156,9 @@ class _Walks:
         if not path.exists():
             save_weights(path, trial)
         there = load_weights(path, self.campaign.robot)
+        if there.others.keys() != trial.others.keys():
+            names, got = (", ".join(sorted(w.others)) or "none" for w in (trial, there))
+            raise InputError(f"{path}: others must be those of the start, {names}; got {got}")
         if jax.tree.all(jax.tree.map(np.array_equal, there, trial)):
             return state
         steps = parameters.steps_between(state.start, there, config.others)
