@@ -1,53 +1,75 @@
-"""The set `best` of a run: its settings, and which point of the path of its tuning it is."""
-
-import itertools
-from concurrent.futures import Executor
-from types import SimpleNamespace
+"""The set `best` of a run: its settings, and the plants on whose walks it is tuned further."""
 
 import jax
 import numpy as np
 import pytest
 from model import BEST_OTHERS, CONFIG, ROBOT
-from pretend import instead, pretend_score, pretend_tuning
 
-from hector_jax.cli import run_folder
+from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.flags import Tune
 from hector_jax.control.parameters import GROUPS
-from hector_jax.control.reference import named_command
 from hector_jax.control.weights import nominal
 from hector_jax.core.inputs import InputError
-from hector_jax.store.setup import Setup
+from hector_jax.sim.world import hfs
 from hector_jax.tuning.loss import alphas
-from hector_jax.verdict import choice, judging
+from hector_jax.verdict import choice
 
 
-def test_start_quarter_half_and_end_of_the_accepted_path_walk():
-    points = choice.points_of(pretend_tuning(16, refused=range(1, 16, 2)))
-    assert list(points) == ["iteration 0", "iteration 4", "iteration 8", "iteration 16"]
-    assert list(choice.points_of(pretend_tuning(0))) == ["iteration 0"]
+def masses(plants):
+    return [float(plant.mass) for plant in plants]
 
 
-@pytest.mark.parametrize("winner", ["set 0", "set 2"])
-def test_the_set_that_walks_best_on_drawn_plants_is_taken(monkeypatch, capsys, winner):
-    def judge(setup, sets, command, plants, seeds, **notes):
-        walked.append({float(plant.mass) for plant in plants})
-        scale = 1.0 if command is straight else 100.0
-        scores = {name: [pretend_score(scale * losses[name])] * len(plants) for name in sets}
-        return SimpleNamespace(scores=scores)
+@pytest.mark.parametrize(
+    ("given", "commands", "plants", "walks"),
+    [
+        ((None, None), 1, 8, 24),  # three sets
+        ((None, None), 3, 8, 72),
+        ((2, None), 1, 2, 6),
+        ((0, None), 1, 1, 3),  # the hfs
+        ((None, 0), 1, 1, 0),
+        ((None, 2), 1, 1, 2),
+        ((None, 40), 1, 5, 40),  # eight sets
+        ((None, 36), 3, 1, 36),
+        ((None, 100_000), 1, 16, 100_000),
+        ((3, 24), 2, 3, 24),
+    ],
+)
+def test_a_budget_of_walks_is_of_three_sets_on_eight_plants_or_of_eight_on_more(
+    given, commands, plants, walks
+):
+    found, budget = choice.walk_plants(ROBOT, *given, commands)
+    assert (len(found), budget) == (plants, walks)
+    if given[0] == 0:
+        same = jax.tree.map(np.array_equal, found, [hfs(ROBOT.description)])
+        assert jax.tree.all(same)
+    else:  # a larger budget begins with the same plants
+        assert masses(found) == masses(choice.drawn_plants(ROBOT, 16)[:plants])
+        assert len(set(masses(found))) == plants
 
-    instead(monkeypatch, judging, "judge", judge)
-    walked = []
-    losses = {"set 0": 1.0, "set 1": 0.9, "set 2": 1.1, "set 3": 2.0, winner: 0.5}
-    setup, sets = Setup(Executor(), CONFIG, ROBOT), dict.fromkeys(losses, nominal())
-    straight, turning = map(named_command, ("straight", "c"))
-    for plants in (3, choice.HELD_OUT):  # after a tuning, and after walks
-        best = choice.walks_best(setup, sets, (straight, turning), plants, seconds=4.0, folder=None)
-        assert best == winner
-    tuned_on = {float(plant.mass) for plant in choice.drawn_plants(ROBOT, 1000)}  # the most
-    assert [len(plants) for plants in walked] == [3, 3, 8, 8]
-    assert not any(a & b for a, b in itertools.combinations((tuned_on, *walked[::2]), 2))
-    said = capsys.readouterr().err
-    assert f"best: {winner} of set 0 to set 3 walks best on 3 plants drawn around the hfs" in said
+
+def test_plants_of_a_tuning_are_none_that_judge_it():
+    standin = masses(arguments.plants("standin", range(32), ROBOT.description))
+    assert not {*standin} & {*masses(choice.drawn_plants(ROBOT, 1000))}
+
+
+@pytest.mark.parametrize(
+    ("given", "commands", "words"),
+    [
+        ((None, 1), 1, "at least 2 (1 command on 1 plant, twice), got 1"),
+        ((None, 5), 3, "at least 6 (3 commands on 1 plant, twice), got 5"),
+        ((8, 15), 1, "at least 16 (1 command on 8 plants, twice), got 15"),
+        ((0, 3), 2, "at least 4 (2 commands on 1 plant, twice), got 3"),
+    ],
+)
+def test_a_budget_with_which_no_second_set_walks_is_one_line(given, commands, words):
+    with pytest.raises(InputError) as error:
+        choice.walk_plants(ROBOT, *given, commands)
+    assert str(error.value) == f"--walks must be 0 or {words}"
+
+
+def test_a_budget_that_is_too_small_is_told_before_there_is_a_run():
+    with pytest.raises(InputError, match=r"--walks must be 0 or at least 6 \(3 commands on 1 pl"):
+        run_folder.trajectories(Tune(traj=("all",), walks=5), ROBOT)
 
 
 def test_best_is_tuned_with_numbers_of_its_own_and_smoothly_where_asked():

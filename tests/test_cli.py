@@ -167,12 +167,13 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     small = CollectConfig(walks=6, seconds=1.0)
     monkeypatch.setattr(nets, "CollectConfig", lambda: small)
-    flags = ("--seeds", "2", "--iterations", "6")
+    flags = ("--seeds", "2", "--iterations", "6", "--walk-plants", "1")
     assert call(monkeypatch, "tune", *flags, "--out", "run", "--json") == 0
     out, run = capsys.readouterr().out, tmp_path / "run"
     result = json.loads((run / "result.json").read_text())
     assert json.loads(out) == {"run": "run", "traj": "straight", **result}
-    assert from_file(Tune, run / "config.json") == Tune(seeds=2, iterations=6, json=True)
+    asked = {"seeds": 2, "iterations": 6, "walk_plants": 1}
+    assert from_file(Tune, run / "config.json") == Tune(**asked, json=True)
     assert float(json.loads((run / "versions.json").read_text())["seconds"]) > 0.0
     assert list(result["sets"]) == ["nominal", "expert", "without", "with", "best"]
     for name, worlds in result["sets"].items():
@@ -187,15 +188,20 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     best = load_weights(run / "weights" / "best.json")
     assert best.others == {**best.others, **BEST_OTHERS}
     assert best.others.keys() == {*BEST_OTHERS, *GROUPS["integral"]}
-    assert result["chosen"].startswith("iteration ")
-    assert "hardware stand-in" in (run / "report.md").read_text()
+    start, *steps = result["walks"]
+    assert start == {"change": 0.0, "falls": 0, "accepted": True}
+    assert 1 <= len(steps) <= 2  # of the three sets of the budget
+    assert len(list((run / "walks" / "logs").glob("*.npz"))) == 1 + len(steps)
+    report = (run / "report.md").read_text()
+    for words in ("hardware stand-in", "## Tuning on walks", "Each weight set walked 1 time "):
+        assert words in report
     for picture in ("tracking", "path", "losses", "weights", "wrenches", "training"):
         assert (run / "pictures" / f"{picture}.png").stat().st_size > 10_000
 
     # one set for two trajectories, from those weights, on the same data
     start, flags = run / "weights" / "with.json", ("--seeds", "1", "--iterations", "4")
     several = ("--traj", "straight", "c", "--start", start, "--no-video", "--out", "both")
-    several += ("--tune", "turn_lead", "--net", Path("data/grfm.npz"), "--verdict")
+    several += ("--tune", "turn_lead", "--net", Path("data/grfm.npz"), "--verdict", "--walks", "0")
     assert call(monkeypatch, "tune", *flags, *several) == 0
     out = capsys.readouterr().out
     assert "change of L against nominal in %" in out
@@ -219,6 +225,8 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     report = Path("both/report.md").read_text()
     for words in ("- turn_lead: 0.5 at the start", "walking: straight, c"):
         assert words in report
+    assert "Tuning on walks" not in report
+    assert "walks" not in result
 
     # the nets of these data
     assert call(monkeypatch, "grfm", "--seeds", "0", "--json") == 0

@@ -26,7 +26,7 @@ from hector_jax.store.nets import CollectConfig
 SHORT = 'name = "{}"\n[[segment]]\nseconds = 0.2\nv_x = {}\n'
 SPEEDS = {"straight": 0.3, "c": 0.25, "s": 0.2, "slalom": 0.15}
 SMALL = {
-    "tune": "--iterations 1 --seeds 1 --no-video",
+    "tune": "--iterations 1 --seeds 1 --no-video --walk-plants 1",
     "evaluate": "--seeds 1",
     "verdict": "--seeds 1 --model-seeds 1 --engine-seeds 1",
     "collect": "--walks 3 --seconds 0.2 --engine c",
@@ -46,12 +46,14 @@ def words_of(line):
     for flag in {"--seeds", "--walks", "--engine"} & {*small, *words}:
         if flag in small and flag in words:
             del words[words.index(flag) : words.index(flag) + 2]
+    if "--walk-plants" in words:
+        small = small[: small.index("--walk-plants")]
     if command == "tune" and "--walker" in words:  # or as the run that is resumed
         small = ["--seeds", "1"]
     if "--resume" in words:
         small = []
-    if command == "tune" and "--walks" in words:
-        words[words.index("--walks") + 1] = "12" if "c" in words else "8"
+    if command == "tune" and "--walks" in words and "0" not in words:
+        words[words.index("--walks") + 1] = "6" if "c" in words else "4"
     if command == "tune" and not {"--traj", "--resume", "--config"} & {*words}:
         words += ["--traj", "straight"]
     files = command not in SECONDS or "runs/robot" in line  # that `hector propose` was given
@@ -85,14 +87,14 @@ def documented(*pages):
 
 PAIRS = [
     "hector tune --traj straight --walks 4 --smooth 10 --out runs/smooth",
-    "hector export runs/smooth --set before_walks",
+    "hector export runs/smooth --set with",
     "hector tune --resume runs/smooth",
     "hector tune --traj straight --walks 4 --alpha auto --tune all --out runs/auto",
-    "hector tune --traj straight --walks 4 --tune legs --walk-plants 0 --out runs/legs",
+    "hector tune --traj straight --walks 4 --tune footsteps --walk-plants 0 --out runs/hfs",
     "hector tune --robot examples/quadruped/robot.toml --walks 4 --out runs/four",
     "hector view runs/four",
     "hector export runs/four",
-    "hector tune --traj straight --variant paper --out runs/paper",
+    "hector tune --traj straight --variant paper --walks 0 --out runs/paper",
     "hector export runs/paper",
     "hector tune --traj straight c --each --walks 4 --safe 0.05 --out runs/each",
     "hector tune --resume runs/each/short-c",

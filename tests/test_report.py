@@ -8,13 +8,14 @@ from pretend import SETS, pretend_history, pretend_verdict, tuning_of
 from rich.console import Console
 
 from hector_jax.control.parameters import bounds
+from hector_jax.control.weights import nominal
 from hector_jax.core.environment import environment
 from hector_jax.report import report
 from hector_jax.report.report import Picture, print_table
 from hector_jax.report.run import write_run_report
 from hector_jax.tuning.curvature import Determined, Direction
 from hector_jax.tuning.status import StepStatus, Stop
-from hector_jax.walk_tuning.walks import Change
+from hector_jax.walk_tuning.walks import WalkedSet, WalkTuning
 
 
 def printed(verdict, **options):
@@ -41,18 +42,23 @@ def written(folder, verdict=None, **others):
         "errors": errors(),
         "pictures": [Picture("loss.png", "Loss by iteration.")],
         "film": "no film: MuJoCo cannot draw here (egl: no device)",
-        "config": {"traj": "straight", "seeds": 8, "choice_plants": 4, "tune": {"ridge": 0.003}},
+        "config": {"traj": "straight", "seeds": 8, "tune": {"ridge": 0.003}},
         "environment": environment(),
         "command": "make tune TRAJ=straight",
         "run": "latest",
-        "proposals": (),
-        "best_proposal": "",
-        "cases": 0,
-        "chosen": "iteration 3",
+        "walks": None,
         "smooth": 10.0,
         "draws": 4,
     }
     return write_run_report(folder, **contents | others).read_text()
+
+
+def tuned_on_walks():
+    """Five sets in four cases, of which some fall."""
+    losses = [1e6 * np.ones(4), 0.9e6 * np.ones(4), 0.81e6 * np.ones(4), np.full(4, np.inf)]
+    losses[2][3] = np.inf
+    rows = zip([*losses, 1.1e6 * np.ones(4)], (True, True, True, False, False), strict=True)
+    return WalkTuning([WalkedSet(nominal(), *row) for row in rows], None, "4 iterations")
 
 
 def errors(**more):
@@ -129,22 +135,23 @@ ended because: 14 iterations
 2 (m g)^2
 another value may be as good: `R_Mz`.
 make tune TRAJ=straight
-- taken: iteration 3
 This run: 1e5, 2e5,
-`best` minimises the mean of L / L(start) over 4 drawn models
+`best` first minimises the mean of L / L(start) over 4 drawn models
 cost 11 times as much, plus 0.003 / 2 times the squared log-steps
-the iteration that walks best on 4 plants drawn around the hfs
 the robot fell on 1 of 8 plants.
 """
 OF_WALKS = """
 This run: 1e5, 2e5, 0.623.
 | touchdown, sideways [cm^2] | 4 | 4 | 4 |
 [Before and after.](film.mp4)
-Each weight set was walked 6 times
-the one that walks best there is `best`: set 1.
-| 0, start |  | +0.0 |
-| 1, model | -12.3 | -10.0 |
-| 2, model | -5.0 | fell |
+Each weight set walked 4 times (all trajectories, on each plant)
+`best` is set 1, the last accepted one that falls in no more walks than the start
+; the tuning ended since 4 iterations.
+| 0 | +0.0 | 0 | accepted |
+| 1 | -10.0 | 0 | accepted |
+| 2 | -19.0 | 1 | accepted |
+| 3 |  | 4 | refused |
+| 4 | +10.0 | 0 | refused |
 void: the falls differ
 The legs touched each other, which is no fall: with 0.030 s in all.
 """
@@ -155,7 +162,8 @@ def test_the_report_tells_what_was_promised_and_what_is_particular_to_a_run(tmp_
     text = written(tmp_path, verdict)
     for words in PROMISED.strip().splitlines():
         assert words in text
-    assert "touchdown" not in text
+    for words in ("touchdown", "Tuning on walks"):
+        assert words not in text
     weighed = (*verdict.loss[:2], verdict.loss[2]._replace(weight=0.623))  # a robot's own
     touch = verdict.scores["with"]._replace(legs_touch=np.array([[0.03]] + [[0.0]] * 7))
     verdict = verdict._replace(scores=verdict.scores | {"with": touch}, loss=weighed)
@@ -165,13 +173,7 @@ def test_the_report_tells_what_was_promised_and_what_is_particular_to_a_run(tmp_
         verdict,
         errors=errors(touchdown=[9.0, 4.0]),
         film=Picture("film.mp4", "Before and after."),
-        proposals=[
-            Change("start", None, 0),
-            Change("model", -12.34, -10),
-            Change("model", -5, None),
-        ],
-        best_proposal="set 1",
-        cases=6,
+        walks=tuned_on_walks(),
     )
     for words in OF_WALKS.strip().splitlines():
         assert words in text

@@ -1,9 +1,11 @@
-"""Reports of walks: whose log is refused, what is shown of it, what is undone, and what is kept.
+"""Reports of walks: whose log is refused, what is shown, undone and kept, and how it ends.
 
-The logs are drawn, not walked: what is tried here is what the folder makes of them.
+The logs are drawn, not walked, and so is the slope: what is tried here is what the folder makes of
+them.
 """
 
 import json
+import os
 from contextlib import nullcontext, suppress
 from dataclasses import replace
 from itertools import product
@@ -13,32 +15,42 @@ import jax
 import numpy as np
 import pytest
 from pretend import instead
-from test_walks import HandsOver
+from test_walks import HandsOver, same, same_sets
 
 from hector_jax.cli import evaluate, propose
 from hector_jax.cli.flags import Propose, Report, Walk
 from hector_jax.control.trajectories import load_command
-from hector_jax.control.weights import expert, nominal
+from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, no_samples
 from hector_jax.core.tree_file import named_leaves, save_tree
 from hector_jax.robot.model import load_robot
-from hector_jax.search.few_walks import Proposal
+from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import loss_of_robot
 from hector_jax.walk_tuning import reported_walks, walk_log, walks
 
 SECONDS = 0.1
 SPEEDS = {"ahead": (0.5, 0.0), "aside": (0.0, 0.5), "back": (-0.5, 0.0)}
 TOML = 'name = "{}"\n[[segment]]\nseconds = 0.1\nv_x = {}\nv_y = {}\n'
-POINTS = 0.1 * np.random.default_rng(0).standard_normal((9, 19))
 ROBOT = jax.tree.map(np.asarray, load_robot())
+NOMINAL = np.asarray(weights_to_vector(nominal(ROBOT)))
+DOWN = np.r_[0.5 * np.ones(12) / np.sqrt(12.0), np.zeros(12)]  # half an e-fold, of Q
+LENGTH = {"slope": 100.0}  # [e-folds] from nominal, where the slope ends
 
 
-def proposed(space, history, *_, **__):
-    """The next of POINTS, from the start on."""
-    first = Proposal(np.zeros(19), "start", None)
-    return Proposal(POINTS[len(history)], "model", -0.1) if history else first
+def ground(campaign, weights, case, log):
+    """A slope that is the same up to some distance from the start, and then none."""
+    vector = np.asarray(weights_to_vector(weights))
+    goes_on = np.linalg.norm(np.log(vector / NOMINAL)) < LENGTH["slope"]
+    slope = vector_to_weights(-DOWN / vector * goes_on)
+    gradient = jax.tree.map(np.asarray, slope._replace(others={n: 0.0 for n in weights.others}))
+    terms = {term.name: np.ones(()) for term in campaign.config.loss}
+    return None, Evaluation(np.ones(()), terms, gradient, np.zeros(()), np.zeros(()))
+
+
+def matrix(config, grounding, weights, walk):
+    return np.eye(18)
 
 
 @pytest.fixture
@@ -46,24 +58,21 @@ def folder(monkeypatch, tmp_path):
     """A folder for reports of three trajectories, in which nothing is computed for a proposal."""
     pool = HandsOver()
     monkeypatch.setattr(propose, "workers", lambda *_: nullcontext(pool))
-    instead(monkeypatch, walks.few_walks, "propose", proposed)
-    instead(monkeypatch, walks.few_walks, "needs_model", lambda *_: False)
-    instead(monkeypatch, walks.few_walks, "incumbent", lambda _, h: walks.few_walks.best_walk(h))
+    monkeypatch.setattr(walks, "_ground", ground)
+    monkeypatch.setattr(walks, "matrix_job", matrix)
     monkeypatch.setattr(propose.arguments, "beyond", lambda *_: "")  # takes a quarter of a second
     monkeypatch.setattr(propose.arguments, "limits", lambda *_: None)
     monkeypatch.chdir(tmp_path)
     for name, speed in SPEEDS.items():
         Path(f"{name}.toml").write_text(TOML.format(name, *speed))
-    folder = Path("robot")
-    save_tree(folder / "metric.npz", {"matrix": np.eye(18)}, kind="metric", robot=ROBOT)
-    return folder
+    return Path("robot")
 
 
 def next_walk(folder, names=("ahead", "aside", "back"), start="nominal"):
     flags = {}
     if not (folder / "config.json").exists():
         files = tuple(f"{name}.toml" for name in names)
-        flags = {"traj": files, "start": start, "tune": ("foot_height",)}
+        flags = {"traj": files, "start": start}
     propose.run_propose(Propose(folder, json=True, **flags))
 
 
@@ -157,7 +166,7 @@ def test_a_log_of_something_else_is_refused(folder):
     ):
         refused(folder, f"^ahead.npz: {words}", carded(folder, "ahead", card=card))
     own = load_weights(walks.weights_path(folder, 0), ROBOT)
-    higher = own._replace(others={"foot_height": own.others["foot_height"] + 0.01})
+    higher = own._replace(others={"foot_height": np.array(0.09)})
     words = r"^ahead.npz: a walk with other weights than the proposed ones, robot/weights/0.json$"
     refused(folder, words, carded(folder, "ahead", weights=higher))
 
@@ -178,7 +187,11 @@ def test_what_a_campaign_cannot_do_now_is_one_line(folder):
         propose.run_propose(Propose(folder, ("s",)))
     log = carded(folder, "ahead")
     report(folder, log)
-    refused(folder, "no walk is waited for", log)
+    refused(folder, "other weights than the proposed ones, robot/weights/1.json", log)
+    with np.load(log) as archive:
+        np.savez("bare.npz", **{n: x for n, x in archive.items() if n != "card"})
+    report(folder, "bare.npz")
+    refused(folder, "^bare.npz: was reported before, it is robot/logs/1-0.npz$", "bare.npz")
     with pytest.raises(InputError, match="nothing was proposed here"):
         report(Path("other"), log)
 
@@ -211,29 +224,42 @@ def test_a_report_that_is_undone_and_made_again_leaves_the_same_bytes(folder, ca
     assert (undone["walk"], undone["weights"]) == (1, "robot/weights/1.json")
     log = Path(*undone["logs"])
     assert log.read_bytes() == Path("1.npz").read_bytes()
-    assert content(folder).items() >= before.items()
     next_walk(folder)
     assert result(capsys)["walk"] == 1
+    now = content(folder)
+    assert now.pop(str(log.relative_to(folder)))
+    assert now == before
     report(folder, "1.npz")
     again = content(folder)
     assert again.items() >= after.items()
-    # and no proposal from the history before
-    assert again.keys() - after.keys() == {str(log.relative_to(folder)), "weights/2.json"}
+    assert again.keys() - after.keys() == {str(log.relative_to(folder))}
+
+
+def test_the_first_report_can_be_undone_and_another_one_cannot(folder, capsys):
+    """The start fell in all: a tuning has nowhere to begin, and another log may."""
+    next_walk(folder, ("ahead",))
+    before = content(folder)
+    with pytest.raises(InputError, match="weights cannot be tuned from: the robot fell"):
+        report(folder, plain("ahead", fall_at=0.04))
+    report(folder, undo=True)
+    undone = result(capsys)
+    assert undone["walk"] == 0
+    next_walk(folder)
+    assert result(capsys)["walk"] == 0
+    now = content(folder)
+    assert now.pop(str(Path(*undone["logs"]).relative_to(folder)))
+    assert now == before
+    refused(folder, "^robot: no report to undo$", undo=True)
+    report(folder, plain("ahead"))
+    assert result(capsys)["walk"] == 0
 
 
 def campaign(folder):
     return propose._campaign(propose.from_file(Propose, folder / "config.json"))
 
 
-def rows(folder):
+def read(folder):
     return reported_walks.read_reports(HandsOver(), campaign(folder))
-
-
-def test_later_calls_ground_the_model_on_every_walk_if_the_first_asks_for_it(folder):
-    flags = {"traj": ("ahead.toml",), "start": "nominal", "tune": ("foot_height",)}
-    propose.run_propose(Propose(folder, every_walk=True, **flags))
-    next_walk(folder)
-    assert campaign(folder).model == "every_walk"
 
 
 @pytest.mark.parametrize("undo", [True, False])
@@ -248,8 +274,8 @@ def test_a_report_or_undo_that_is_killed_leaves_the_old_or_the_new_state(folder,
         next_walk(folder)
     reported, undone = ((log,), {}), ((), {"undo": True})
     (logs, flags), (logs_back, flags_back) = (undone, reported) if undo else (reported, undone)
-    record, kills, calls = folder / "walks.jsonl", 0, []
-    old = record.read_bytes()
+    log_kept, kills, calls = folder / "logs" / "1-0.npz", 0, []
+    old = content(folder)
 
     def killed(real, at, after):
         def step(*args, **options):
@@ -264,27 +290,25 @@ def test_a_report_or_undo_that_is_killed_leaves_the_old_or_the_new_state(folder,
 
         return step
 
-    writes = (walks, "add_row"), (reported_walks, "write_file"), (Path, "replace")
-    for at, after in product(range(1, 6), (False, True)):
+    writes = (os, "replace"), (Path, "unlink")
+    for at, after in product(range(1, 16), (False, True)):
         with pytest.MonkeyPatch.context() as patch:
             calls.clear()
             for module, name in writes:
                 patch.setattr(module, name, killed(getattr(module, name), at, after))
             with suppress(KeyboardInterrupt):
                 report(folder, *logs, **flags)
+        if len(calls) < at and not after:
+            break
         kills += len(calls) >= at
-        number = len(rows(folder))
-        waits = walks.read_record(campaign(folder))[1] is not None
         assert Path("1.npz").read_bytes() in content(folder).values() or not undo
-        if record.read_bytes() == old:
-            assert (number, waits) == (2 if undo else 1, True)
-            continue
-        assert (number, waits) == (1 if undo else 2, undo)
-        report(folder, *logs_back, **flags_back)
-        if undo:
-            next_walk(folder)
-        assert record.read_bytes() == old
-    assert kills == 2 * len(calls) == 4
+        walked = log_kept.exists()
+        assert read(folder).number == (2 if walked else 1)
+        if walked != undo:
+            report(folder, *logs_back, **flags_back)
+        next_walk(folder)
+        assert {n: x for n, x in content(folder).items() if "undone" not in n} == old
+    assert kills == 2 * len(calls) >= 4
 
 
 def test_reports_outlive_the_code_that_took_them_and_are_scored_by_the_present_loss(
@@ -293,24 +317,146 @@ def test_reports_outlive_the_code_that_took_them_and_are_scored_by_the_present_l
     for number in (1, 2):
         next_walk(folder, ("ahead", "aside"))
         report(folder, *(plain(name, error=0.003 * number) for name in ("ahead", "aside")))
-    before, files = rows(folder), content(folder)
+    before, files = read(folder), content(folder)
     for module in ("store.cache", "walk_tuning.walks"):
         monkeypatch.setattr(f"hector_jax.{module}.code_hash", lambda *_: "of other code")
     monkeypatch.setattr("hector_jax.core.environment.version", lambda package: "99")
-    for old, new in zip(before, rows(folder), strict=True):
-        jax.tree.map(np.testing.assert_array_equal, old, new)
+    now = read(folder)
+    assert same_sets(now.tuning.sets, before.tuning.sets)
+    assert content(folder) == files
 
     def heavier(description):
         return loss_of_robot(replace(description, loss=(("L_pos", 1e9),)))
 
     instead(monkeypatch, propose.tunings, "loss_of_robot", heavier)
-    after = rows(folder)
-    for old, new in zip(before, after, strict=True):
+    after = read(folder)
+    assert (after.number, len(after.tuning.sets)) == (2, 2)
+    for old, new in zip(before.tuning.sets, after.tuning.sets, strict=True):
         assert np.all(new.losses > 2.0 * old.losses)
-        np.testing.assert_array_equal(new.point, old.point)
-    assert (before[1].predicted, after[1].predicted) == (-0.1, None)  # it was of the other loss
-    assert content(folder) == files
+        assert same(new.weights, old.weights)
+    assert same(after.waiting, before.waiting)  # as it was proposed
+    changed = {name for name, data in content(folder).items() if files[name] != data}
+    assert changed == {"walks.jsonl"}
     next_walk(folder)  # and it goes on
+
+
+# The end
+
+
+def loss_of_ahead(folder, error):
+    """L of a walk with this error [m]."""
+    one, path = campaign(folder), Path(plain("ahead", "scored.npz", error=error))
+    log = walk_log.read_log(path, ROBOT, SECONDS, one.config.rollout.walk.gait.tick)
+    return walk_log.evaluate_log(one.config, ROBOT, one.commands["ahead"], log)[0].loss
+
+
+@pytest.fixture
+def ended(folder, monkeypatch, capsys):
+    """A function that reports walks with these errors [m] until, after two steps, a tuning ends."""
+    monkeypatch.setitem(LENGTH, "slope", 0.9)
+
+    def walked(*errors, names=("ahead",), **options):
+        next_walk(folder, names)
+        for number, error in enumerate(errors):
+            logs = [plain(name, f"{name}-{number}.npz", error=error) for name in names]
+            capsys.readouterr()
+            report(folder, *logs, **options)
+        return result(capsys)
+
+    return walked
+
+
+def test_the_best_set_of_a_tuning_that_has_ended_is_asked_for_again(folder, ended, capsys):
+    found = ended(0.02, 0.015, 0.01)
+    assert (found["walk"], found["best"], found["again"]) == (2, 2, None)
+    assert found["change"] < 0.0
+    assert "predicted to gain too little" in found["ended"]
+    next_walk(folder)
+    asked = result(capsys)
+    assert (asked["walk"], asked["weights"]) == (3, "robot/weights/3.json")
+    assert asked["ended"] == found["ended"]
+    best = Path(found["weights"])
+    assert best == folder / "weights" / "2.json"
+    assert Path(asked["weights"]).read_bytes() == best.read_bytes()
+    refused(folder, "was reported before, it is robot/logs/2-0.npz", "ahead-2.npz")
+
+
+def test_the_best_set_is_called_clear_by_walks_that_did_not_choose_it(folder, ended, capsys):
+    ended(0.02, 0.015, 0.01)
+    start, *again = (np.log(loss_of_ahead(folder, error)) for error in (0.02, 0.0105, 0.011))
+    for number, (error, logs) in enumerate(((0.0105, 1), (0.011, 2)), 3):
+        report(folder, plain("ahead", f"again-{number}.npz", error=error))
+        found = result(capsys)
+        mean = np.mean(again[:logs]) - start
+        assert (found["walk"], found["best"]) == (number, 2)
+        assert found["again"]["change"] == pytest.approx(100.0 * np.expm1(mean))
+        assert found["again"]["clear"] is True
+        assert found["change"] == found["again"]["change"]
+    propose.run_report(Report(folder, (plain("ahead", "last.npz", error=0.0103),)))
+    text = capsys.readouterr().out
+    assert "best is walk 2, L -" in text
+    assert "in walks that did not choose it\n" in text
+    assert "not distinguishable" not in text
+
+
+def test_a_gain_that_only_the_walk_that_chose_the_set_shows_is_not_called_clear(
+    folder, ended, capsys
+):
+    ended(0.02, 0.015, 0.01)
+    propose.run_report(Report(folder, (plain("ahead", "last.npz", error=0.0195),)))
+    text = capsys.readouterr().out
+    assert "in walks that did not choose it: not distinguishable from the start" in text
+    assert read(folder).again.clear is False
+
+
+def test_a_walk_of_the_best_set_is_undone_and_the_same_set_waits(folder, ended, capsys):
+    ended(0.02, 0.015, 0.01)
+    before = content(folder)
+    report(folder, plain("ahead", "last.npz", error=0.0105))
+    capsys.readouterr()
+    report(folder, undo=True)
+    undone = result(capsys)
+    assert (undone["walk"], undone["weights"]) == (3, "robot/weights/3.json")
+    next_walk(folder)
+    assert result(capsys)["walk"] == 3
+    now = content(folder)
+    assert now.pop(str(Path(*undone["logs"]).relative_to(folder))) == Path("last.npz").read_bytes()
+    assert now == before
+    assert read(folder).again is None
+
+
+def test_a_fall_of_the_best_set_is_no_change_of_the_loss(folder, ended, capsys):
+    ended(0.02, 0.015, 0.01)
+    propose.run_report(Report(folder, (plain("ahead", "last.npz", fall_at=0.04),)))
+    assert "walk 3: fell; best is walk 2, fell, in walks that did not" in capsys.readouterr().out
+    assert read(folder).again == (None, False)
+
+
+def test_again_compares_the_cases_in_which_all_stood(folder, ended, capsys):
+    """The start fell in one of two, which is no gain of all that there is."""
+    next_walk(folder, ("ahead", "aside"))
+    for number, error in enumerate((0.02, 0.015, 0.01, 0.0105)):
+        aside = {"fall_at": 0.04} if number == 0 else {"error": error}
+        capsys.readouterr()
+        report(
+            folder,
+            plain("ahead", f"ahead-{number}.npz", error=error),
+            plain("aside", f"aside-{number}.npz", **aside),
+        )
+    found = result(capsys)
+    assert found["walk"] == 3
+    start, again = (loss_of_ahead(folder, error) for error in (0.02, 0.0105))
+    assert found["again"]["change"] == pytest.approx(100.0 * (again / start - 1.0))
+
+
+def test_only_walks_of_the_best_set_count_as_such(folder, ended, monkeypatch):
+    """Not those of steps that are none any more, as the loss is another."""
+    ended(0.02, 0.015, 0.01)
+    monkeypatch.setitem(LENGTH, "slope", 0.4)
+    found = read(folder)
+    assert (len(found.tuning.sets), found.number, found.again) == (2, 3, None)
+    assert same(found.waiting, found.tuning.sets[1].weights)
+    assert same(load_weights(walks.weights_path(folder, 3), ROBOT), found.waiting)
 
 
 def test_the_log_of_a_walk_with_the_proposed_file_is_taken(folder, capsys):

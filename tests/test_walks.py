@@ -1,8 +1,15 @@
-"""Tuning on walks: the folder, the logs, and files against walks in process."""
+"""Tuning on walks: the folder, the logs, falls, and files against walks in process.
 
+The first stories are of walks of five ticks, compiled once for all of them; the others of a toy, a
+quadratic in log-weights whose optimum is another in each case.
+"""
+
+import json
 import pickle
-from concurrent.futures import Executor, Future
+import threading
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 
 import jax
 import numpy as np
@@ -11,8 +18,17 @@ from model import AHEAD, BRIEF
 
 from hector_jax.cli import run_folder
 from hector_jax.cli.flags import Tune
-from hector_jax.control.weights import nominal, weights_to_vector
+from hector_jax.control.reference import named_command
+from hector_jax.control.weights import (
+    directions,
+    expert,
+    nominal,
+    vector_to_weights,
+    weights_to_vector,
+)
+from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import save_tree
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.engine import MUJOCO_C
@@ -20,20 +36,15 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import loss_of
+from hector_jax.verdict.choice import drawn_plants
 from hector_jax.walk_tuning import campaign as campaigns
 from hector_jax.walk_tuning import reported_walks, walk_log, walks
-from hector_jax.walk_tuning.grounded_model import replayed
 
 # all walks of this file are of these ticks and this command: one set of programs for all tests
-CONFIG, COMMAND, SECONDS = TuneConfig(rollout=BRIEF), {"short": AHEAD}, 0.05
-WALKS = 8  # so many that each of the methods proposes one
-SHORT = """
-name = "short"
-[[segment]]
-seconds = 0.05
-v_x = 0.3
-"""
+CONFIG, COMMAND, SECONDS = TuneConfig(rollout=BRIEF, least_gain=1e-6), {"short": AHEAD}, 0.05
+SETS = 3
 
 
 class HandsOver(Executor):
@@ -57,16 +68,30 @@ def pool():
     return HandsOver()
 
 
-def campaign(folder, robot, plants=(None,), seed=0):
-    inputs = folder, CONFIG, robot, nominal(robot), COMMAND, plants, seed
-    return campaigns.Campaign(*inputs, leg_numbers=("foot_height",))
+def campaign(folder, robot, plants=(None,), **others):
+    return campaigns.Campaign(
+        **{"folder": folder, "config": CONFIG, "robot": robot, "start": nominal(robot)}
+        | {"commands": COMMAND, "plants": plants}
+        | others
+    )
+
+
+def same(a, b):
+    """Whether two trees are equal to the last bit."""
+    return jax.tree.all(jax.tree.map(np.array_equal, a, b))
+
+
+def same_sets(a, b):
+    return len(a) == len(b) and all(map(same, a, b))
+
+
+# On the simulator
 
 
 @pytest.fixture(scope="module")
 def in_process(robot, pool, tmp_path_factory):
     one = campaign(tmp_path_factory.mktemp("walked"), robot, [hfs()])
-    rows = walks.tune_on_walks(pool, one, WALKS)
-    return one, walks.answer(one, walks.campaign_space(pool, one), rows)[0], rows
+    return one, walks.tune_on_walks(pool, one, walks=SETS)
 
 
 def walked(robot, weights, path):
@@ -75,50 +100,34 @@ def walked(robot, weights, path):
     return path
 
 
-def test_eight_walks_through_files_equal_eight_in_process_to_the_last_bit(
+def test_walks_through_files_equal_those_in_process_to_the_last_bit(
     robot, pool, in_process, tmp_path
 ):
-    one, (_, _, rows) = campaign(tmp_path, robot), in_process
-    space, again = walks.campaign_space(pool, one), []
-    for number in range(WALKS):
-        again = reported_walks.read_reports(pool, one)  # as a new process would
-        proposal, weights = walks.next_proposal(pool, one, space, again)
-        log = walked(robot, weights, tmp_path / f"{number}.npz")
-        again = reported_walks.add_report(pool, one, proposal, [log])
-    assert len(again) == len(rows) == WALKS
-    for mine, theirs in zip(again, rows, strict=True):
-        np.testing.assert_array_equal(mine.point, theirs.point)
-        np.testing.assert_array_equal(mine.losses, theirs.losses)
-        assert (mine.method, mine.predicted) == (theirs.method, theirs.predicted)
-    assert {row.method for row in rows} == {"start", "model", "surrogate"}
-    assert min(row.losses[0] for row in rows) < 0.9 * rows[0].losses[0]
+    one, (_, theirs) = campaign(tmp_path, robot), in_process
+    for number in range(SETS):
+        found = reported_walks.read_reports(pool, one)  # as a new process would
+        assert (found.number, found.again, found.tuning.reason) == (number, None, "")
+        waiting = load_weights(walks.weights_path(tmp_path, number), robot)
+        assert same(waiting, found.waiting)
+        log = walked(robot, waiting, tmp_path / f"{number}.npz")
+        reported_walks.add_report(one, number, [log])
+    mine = reported_walks.read_reports(pool, one).tuning
+    assert same_sets(mine.sets, theirs.sets)
+    assert [x.accepted for x in mine.sets].count(True) > 1
+    assert mine.best == theirs.best > 0
+    assert theirs.sets[theirs.best].losses[0] < 0.9 * theirs.sets[0].losses[0]
+    assert theirs.reason == f"{SETS - 1} iterations"
 
 
 def test_what_was_walked_is_not_walked_again(monkeypatch, pool, in_process):
-    one, weights, _ = in_process
+    one, first = in_process
     monkeypatch.setattr(walks, "walk_case", None)
-    again = walks.tune_on_walks(pool, one, WALKS)
-    weights_again, _ = walks.answer(one, walks.campaign_space(pool, one), again)
-    np.testing.assert_array_equal(weights_again.Q.euler, weights.Q.euler)
+    again = walks.tune_on_walks(pool, one, walks=SETS)
+    assert same_sets(again.sets, first.sets)
+    assert again.best == first.best
 
 
-def test_a_model_of_every_walk_is_grounded_on_each(monkeypatch, robot, pool, tmp_path):
-    seen, model_of = [], walks.grounded_model.model_of
-
-    def watched(*inputs):
-        seen.append(len(inputs[3]))
-        return model_of(*inputs)
-
-    monkeypatch.setattr(walks.grounded_model, "model_of", watched)
-    one = replace(campaign(tmp_path, robot, [hfs()]), model="every_walk")
-    rows = walks.tune_on_walks(pool, one, 3)
-    assert [row.method for row in rows] == ["start", "model", "model"]
-    assert rows[1].losses[0] < 0.95 * rows[0].losses[0]
-    assert max(row.predicted for row in rows[1:]) < 0.0
-    assert seen == [1, 2]
-
-
-def test_any_engine_walks_and_is_recorded(robot, in_process, tmp_path):
+def test_any_engine_walks_and_is_recorded(robot, pool, in_process, tmp_path):
     jobs = []
 
     def walk_in(pool, config, robot, some, **options):
@@ -129,67 +138,10 @@ def test_any_engine_walks_and_is_recorded(robot, in_process, tmp_path):
     one = replace(campaign(tmp_path, robot, [hfs()]), engine=engine)
     score, _ = walks.walk_case(one, nominal(robot), 0)
     assert len(jobs) == 1
-    assert score.loss == in_process[2][0].losses[0]
-    walks.read_record(one)
+    assert score.loss == in_process[1].sets[0].losses[0]
+    assert walks.tune_on_walks(pool, one, waits).sets == []  # begins the record
     with pytest.raises(InputError, match="made with engine .mine"):
-        walks.read_record(replace(one, engine=MUJOCO_C))
-
-
-def test_the_record_of_another_tuning_is_refused(robot, in_process):
-    one = replace(in_process[0], seed=1)
-    with pytest.raises(InputError, match=r"made with seed 0, this command expects 1"):
-        walks.read_record(one)
-
-
-def test_a_start_that_falls_is_refused(robot, pool, in_process, tmp_path):
-    one, space = campaign(tmp_path, robot), walks.campaign_space(pool, in_process[0])
-    row = walks.Row(np.zeros(19), "start", None, np.array([np.inf]), 1.0)
-    with pytest.raises(InputError, match="the start fell"):
-        walks.next_proposal(pool, one, space, [row])
-
-
-@pytest.fixture
-def with_legs(robot, pool, tmp_path):
-    config = replace(CONFIG, others=("turn_lead",))
-    one = replace(campaign(tmp_path, robot), config=config, leg_numbers=("foot_height", "kp"))
-    save_tree(tmp_path / "metric.npz", {"matrix": np.eye(19)}, kind="metric", robot=robot)
-    return one, walks.campaign_space(pool, one)
-
-
-def test_numbers_of_the_legs_are_coordinates_of_their_own_within_their_boxes(with_legs):
-    one, space = with_legs
-    assert space.box.shape == (25, 2)
-    point = np.zeros(25)
-    point[[19, 21, 24]] = 1.0, -1.0, 1e3
-    start, moved = one.start.others, campaigns.weights_at(one, space, point).others
-    assert moved["foot_height"] == pytest.approx(start["foot_height"] + 0.018)
-    assert moved["kp"] == pytest.approx(
-        start["kp"] * [1.0, 0.5, 1.0, 1.0, 1.0] + [0, 0, 0, 0, 2980]
-    )
-    assert moved["turn_lead"] == start["turn_lead"]
-    assert campaigns.weights_at(one, space, point).Q.euler == pytest.approx(one.start.Q.euler)
-
-
-def test_the_slope_of_the_model_is_zero_along_the_numbers_of_the_legs(with_legs):
-    one, space = with_legs
-
-    def loss(point):
-        weights = campaigns.weights_at(one, space, point)
-        return weights_to_vector(weights).sum() + weights.others["turn_lead"]
-
-    point = np.linspace(-0.1, 0.1, 25)
-    weights = campaigns.weights_at(one, space, point)
-    gradient = jax.tree.map(np.ones_like, weights)
-    slope = campaigns.slope_of(one, space, weights, gradient)
-    steps = 1e-5 * np.eye(25)
-    differences = [(loss(point + step) - loss(point - step)) / 2e-5 for step in steps]
-    np.testing.assert_allclose(slope, differences, rtol=1e-6, atol=1e-6)
-    np.testing.assert_array_equal(slope[19:], 0.0)
-
-
-def test_the_numbers_of_the_legs_are_tuned_by_walks_alone(robot):
-    with pytest.raises(InputError, match="--tune kp foot_height: only --walks can tune"):
-        run_folder.trajectories(Tune(tune=("kp", "foot_height")), robot)
+        walks.tune_on_walks(pool, replace(one, engine=MUJOCO_C), waits)
 
 
 def test_the_reference_of_a_log_is_that_of_its_walk(robot):
@@ -199,22 +151,314 @@ def test_the_reference_of_a_log_is_that_of_its_walk(robot):
     assert 0.0 < seen.margin < 0.2
 
 
-def test_the_sets_to_choose_from_are_the_start_each_gain_and_the_answer(pool, in_process):
-    one, weights, rows = in_process
-    sets, losses = walks.candidates(pool, one, rows), [row.losses[0] for row in rows]
-    numbers = [int(name.removeprefix("set ")) for name in sets]
-    assert numbers[0] == 0
-    assert numbers == sorted(numbers)
-    gains = {n for n in range(1, WALKS) if losses[n] < 0.99 * min(losses[:n])}
-    assert gains < set(numbers)
-    assert len(set(numbers) - gains) <= 2  # the start and the answer
-    assert any(np.array_equal(each.Q.euler, weights.Q.euler) for each in sets.values())
+def test_numbers_of_the_legs_are_not_tuned(robot):
+    with pytest.raises(InputError, match="foot_height cannot be tuned by gradients"):
+        run_folder.trajectories(Tune(tune=("foot_height",)), robot)
 
 
-def test_a_replay_keeps_the_mean_over_the_gait_cycle_and_takes_the_deviations_of_another():
-    own, other = np.random.default_rng(0).standard_normal((2, 4, 50, 3))  # cycle, phase
-    [replay] = replayed([own.reshape(200, 3)], [other.reshape(200, 3)], cycle=50)
-    replay = replay.reshape(own.shape)
-    np.testing.assert_allclose(replay.mean(0), own.mean(0), atol=1e-12)
-    deviations = np.roll(other - other.mean(0), 2, axis=0)  # half a walk later
-    np.testing.assert_allclose(replay - replay.mean(0), deviations, atol=1e-12)
+# On a toy
+
+NOMINAL = np.asarray(weights_to_vector(nominal()))
+LOG = walk_log.log_of(no_samples(10, 2))  # one without samples: the toy needs none
+WALKED = []  # case and weights of the walks of `toy_case`
+
+
+def away(weights, case):
+    """Logs of the weights against the optimum of a case, an e-fold or so from nominal."""
+    aim = np.linspace(-0.4, 0.2, 18) + 0.05 * case * np.linspace(1.0, -1.0, 18)
+    return np.log(np.asarray(weights_to_vector(weights)) / NOMINAL) - directions().T @ aim
+
+
+def toy_loss(weights, case):
+    """L of a case: a hundredth of it no weights can mend."""
+    off = away(weights, case)
+    return (case + 1) * 1e6 * (0.01 + off @ off)
+
+
+def toy_ground(campaign, weights, case, log):
+    """The slope of the loss of a case; stands for that of the model grounded on its walk."""
+    gradient = 2e6 * (case + 1) * away(weights, case) / np.asarray(weights_to_vector(weights))
+    loss, zero = np.asarray(toy_loss(weights, case)), np.zeros(())
+    terms = {term.name: loss for term in campaign.config.loss}
+    return case, Evaluation(loss, terms, as_weights(gradient), zero, zero)
+
+
+def as_weights(vector):
+    return jax.tree.map(np.asarray, vector_to_weights(vector))
+
+
+def toy_matrix(config, case, weights, walk):
+    return 2e6 * (case + 1) * np.asarray(directions() @ directions().T)
+
+
+def toy_case(campaign, weights, case):
+    """A walk of the toy."""
+    WALKED.append((case, weights))
+    return walk_log.LogScore(toy_loss(weights, case), 0.1), LOG
+
+
+def asked(number, weights, cases=1, fell=lambda number, case, weights: False):
+    """The scored logs of a set, by the toy; those that fell have no loss."""
+    losses = [
+        np.inf if fell(number, case, weights) else toy_loss(weights, case) for case in range(cases)
+    ]
+    return [(walk_log.LogScore(x, 0.1), LOG) for x in losses]
+
+
+def waits(number, weights):
+    raise walks.Waiting
+
+
+class Here(Executor):
+    """Does each job at once in this process."""
+
+    def submit(self, job, *inputs):
+        """Return the result."""
+        done = Future()
+        done.set_result(job(*inputs))
+        return done
+
+
+@pytest.fixture
+def toy(monkeypatch, robot, tmp_path):
+    """A function that makes a campaign whose walks and slopes are those of the toy."""
+    monkeypatch.setattr(walks, "_ground", toy_ground)
+    monkeypatch.setattr(walks, "matrix_job", toy_matrix)
+    monkeypatch.setattr(walks, "walk_case", toy_case)
+    WALKED.clear()
+
+    def made(cases=3, folder="toy", **others):
+        return campaign(tmp_path / folder, robot, drawn_plants(robot, cases), **others)
+
+    return made
+
+
+def test_a_toy_is_tuned_to_the_optimum_of_the_mean_of_log_l(toy):
+    found = walks.tune_on_walks(Here(), toy(), walks=30)
+    slopes = [
+        np.mean([2.0 * away(w, c) / (0.01 + away(w, c) @ away(w, c)) for c in range(3)], axis=0)
+        for w in (found.sets[0].weights, found.sets[found.best].weights)
+    ]
+    assert np.linalg.norm(slopes[1]) < 0.05 * np.linalg.norm(slopes[0])
+    assert found.rows[found.best]["change"] < -90.0
+    assert [row["change"] for row in found.rows] == walks.changes(found.sets)
+    assert found.rows[0] == {"change": 0.0, "falls": 0, "accepted": True}
+
+
+@pytest.mark.parametrize("killed_at", [0, 1, 4, 5])
+def test_a_run_that_is_killed_keeps_each_walk_and_ends_as_one_that_is_not(
+    monkeypatch, toy, killed_at
+):
+    whole = walks.tune_on_walks(Here(), toy(folder="whole"), walks=9)
+    assert [case for case, _ in WALKED] == 3 * [0, 1, 2]
+    WALKED.clear()
+
+    def cut(campaign, weights, case):
+        if len(WALKED) == killed_at:
+            raise KeyboardInterrupt
+        return toy_case(campaign, weights, case)
+
+    with monkeypatch.context() as patch, ThreadPoolExecutor(1) as pool:
+        patch.setattr(walks, "walk_case", cut)
+        with pytest.raises(KeyboardInterrupt):
+            walks.tune_on_walks(pool, toy(), walks=9)
+    again = walks.tune_on_walks(Here(), toy(), walks=9)
+    assert [case for case, _ in WALKED] == 3 * [0, 1, 2]  # none twice
+    assert same_sets(again.sets, whole.sets)
+    for name in ("walks.jsonl", *(f"weights/{i}.json" for i in range(3))):
+        assert (toy().folder / name).read_bytes() == (
+            toy(folder="whole").folder / name
+        ).read_bytes()
+
+
+def test_a_walk_is_kept_as_it_ends_though_one_before_it_has_not(monkeypatch, toy):
+    """With 2 processes a killed run loses 2 walks at most, not all behind the longest."""
+    kept, one = [], toy(cases=4)
+
+    def slow_first(campaign, weights, case):
+        if case == 0:
+            assert others_are_kept.wait(10.0)
+            kept.extend(path.name for path in (one.folder / "logs").glob("*.npz"))
+        return toy_case(campaign, weights, case)
+
+    others_are_kept, save = threading.Event(), walks.save_tree
+
+    def watched_save(path, *inputs, **options):
+        save(path, *inputs, **options)
+        if len(list(path.parent.glob("*.npz"))) == 3:
+            others_are_kept.set()
+
+    monkeypatch.setattr(walks, "walk_case", slow_first)
+    monkeypatch.setattr(walks, "save_tree", watched_save)
+    with ThreadPoolExecutor(2) as pool:
+        walks.walk_all(pool, one, 0, nominal())
+    assert sorted(kept) == ["0-1.npz", "0-2.npz", "0-3.npz"]
+
+
+def test_a_larger_budget_goes_on_from_the_walks_there_are(toy):
+    first = walks.tune_on_walks(Here(), toy(), walks=6)
+    assert (len(first.sets), first.reason) == (2, "1 iteration")
+    assert len(WALKED) == 6
+    more = walks.tune_on_walks(Here(), toy(), walks=14)  # whole sets only
+    assert (len(more.sets), len(WALKED)) == (4, 12)
+    assert same_sets(more.sets[:2], first.sets)
+    less = walks.tune_on_walks(Here(), toy(), walks=6)
+    assert same_sets(less.sets, first.sets)
+    assert len(WALKED) == 12
+
+
+def test_a_set_whose_walks_are_not_made_is_waited_for(toy):
+    def ask(number, weights):
+        seen.append(weights)
+        if number == 2:
+            raise walks.Waiting
+        return ask_all(number, weights)
+
+    ask_all = partial(asked, cases=3)
+    seen, one = [], toy(cases=3)
+    found = walks.tune_on_walks(Here(), one, ask)
+    assert (len(found.sets), found.reason) == (2, "")
+    assert same(found.waiting, seen[-1])
+    assert same(found.waiting, load_weights(walks.weights_path(one.folder, 2)))
+    assert not same(found.waiting, found.sets[1].weights)
+    rows = list(map(json.loads, (one.folder / "walks.jsonl").read_text().splitlines()))
+    assert [row["losses"] for row in rows[1:]] == [x.losses.tolist() for x in found.sets]
+    ended = walks.tune_on_walks(Here(), one, ask_all)
+    assert ended.waiting is None
+    assert same_sets(ended.sets[:2], found.sets)
+
+
+def test_the_walks_count_where_the_code_would_now_step_elsewhere(toy):
+    """The weights in the folder are those that walked."""
+    one, elsewhere = toy(cases=1), expert()
+    save_weights(walks.weights_path(one.folder, 1), elsewhere)
+    found = walks.tune_on_walks(Here(), one, walks=4)
+    np.testing.assert_allclose(
+        weights_to_vector(found.sets[1].weights), weights_to_vector(elsewhere), rtol=1e-12
+    )
+    assert found.sets[1].losses[0] == pytest.approx(toy_loss(elsewhere, 0))
+
+
+# Falls
+
+
+def test_a_fall_is_a_bounded_loss_of_its_case_and_has_no_slope(toy):
+    """Of e times the largest at the start; no loss counts as more."""
+    one, at = toy(cases=3), nominal()
+    start = np.array([toy_loss(at, case) for case in range(3)])
+    objective = walks._Walks(
+        Here(), one, partial(asked, cases=3, fell=lambda n, case, _: (n, case) == (1, 1))
+    )
+    assert float(objective.evaluate(at).loss) == pytest.approx(np.exp(np.log(start).mean()))
+    objective.ask = lambda number, weights: [
+        (walk_log.LogScore(x, 0.1), LOG) for x in (start[0], np.inf, 1e3 * start[2])
+    ]
+    found, worst = objective.evaluate(at), np.e * start[2]
+    value = np.exp(np.mean(np.log([start[0], worst, worst])))
+    assert float(found.loss) == pytest.approx(value)
+    slopes = [
+        np.asarray(weights_to_vector(toy_ground(one, at, c, LOG)[1].gradient)) for c in (0, 2)
+    ]
+    expected = value / 3.0 * sum(g / start[c] for g, c in zip(slopes, (0, 2), strict=True))
+    np.testing.assert_allclose(weights_to_vector(found.gradient), expected, rtol=1e-12)
+    assert float(found.fallen) == 0.0
+
+
+@pytest.mark.parametrize("falls_again", [False, True])
+def test_a_set_that_falls_in_one_of_several_cases_may_be_a_step_but_is_not_the_best(
+    toy, falls_again
+):
+    def fell(number, case, weights):
+        return case == 0 and (number > 0 if falls_again else number == 1)
+
+    found = walks.tune_on_walks(Here(), toy(cases=4), partial(asked, cases=4, fell=fell), 16)
+    falls = [int(x.fell.sum()) for x in found.sets]
+    assert falls[:2] == [0, 1]
+    assert found.sets[1].accepted
+    assert found.rows[1]["change"] < -10.0  # over the cases in which it stood
+    assert found.sets[found.best].fell.sum() == 0
+    assert (found.best == 0) == falls_again
+    accepted = [i for i, x in enumerate(found.sets) if x.accepted]
+    assert (found.best == accepted[-1]) != falls_again
+
+
+def test_a_set_that_falls_in_all_cases_is_refused_and_a_shorter_step_follows(toy):
+    fell = lambda number, case, weights: number in (1, 2)  # noqa: E731
+    found = walks.tune_on_walks(Here(), toy(cases=2), partial(asked, cases=2, fell=fell), 10)
+    assert [x.accepted for x in found.sets[:4]] == [True, False, False, True]
+    assert [row["change"] is None for row in found.rows[:4]] == [False, True, True, False]
+    length = [np.linalg.norm(np.log(weights_to_vector(x.weights) / NOMINAL)) for x in found.sets]
+    assert length[1] > length[2] > length[3] > 0.0
+    assert found.best == len(found.sets) - 1
+
+
+def test_a_start_that_falls_in_all_cases_is_refused_in_one_line_and_in_one_is_tuned(toy):
+    ask = partial(asked, cases=2, fell=lambda *_: True)
+    with pytest.raises(InputError, match="weights cannot be tuned from: the robot fell") as error:
+        walks.tune_on_walks(Here(), toy(cases=2), ask)
+    assert "\n" not in str(error.value)
+    fell = lambda number, case, weights: case == 1  # noqa: E731
+    ask = partial(asked, cases=2, fell=fell)
+    found = walks.tune_on_walks(Here(), toy(cases=2, folder="one"), ask, 10)
+    assert found.best == len(found.sets) - 1 > 0  # in no more cases than the start
+    assert found.rows[found.best]["change"] < -90.0
+
+
+# Whose folder it is
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("plants", "made with plants "),
+        ("robot", "made for another robot of this name"),
+        ("start", "made with start "),
+        ("commands", "made with commands "),
+        ("ridge", "made with settings "),
+        ("least_gain", "made with settings "),
+        ("others", "made with "),
+    ],
+)
+def test_the_record_of_another_tuning_is_refused_in_one_line(toy, robot, change, words):
+    walks.tune_on_walks(Here(), one := toy(), walks=3)
+    before = {path: path.read_bytes() for path in one.folder.rglob("*") if path.is_file()}
+    changes = {
+        "plants": {"plants": drawn_plants(robot, 3, first_seed=1)},
+        "robot": {"robot": robot._replace(mass=np.asarray(1.01 * robot.mass))},
+        "start": {"start": expert()},
+        "commands": {"commands": {"short": named_command("c")}},
+        "ridge": {"config": replace(CONFIG, ridge=0.1)},
+        "least_gain": {"config": replace(CONFIG, least_gain=0.1)},
+        "others": {"config": replace(CONFIG, others=("turn_lead",))},
+    }
+    with pytest.raises(InputError) as error:
+        walks.tune_on_walks(Here(), replace(one, **changes[change]), walks=3)
+    message = str(error.value)
+    assert message.startswith(f"{one.folder / 'walks.jsonl'}: {words}")
+    assert message.endswith("; choose another folder")
+    assert "\n" not in message
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_a_record_or_a_log_that_is_damaged_is_refused_in_one_line(toy):
+    walks.tune_on_walks(Here(), one := toy(), walks=6)
+    log, record = one.folder / "logs" / "1-0.npz", one.folder / "walks.jsonl"
+    whole = log.read_bytes()
+    log.write_bytes(whole[:-30])
+    with pytest.raises(InputError, match=r"1-0.npz: cut or changed"):
+        walks.tune_on_walks(Here(), one, walks=6)
+    log.write_bytes(whole)
+    lines = record.read_text().splitlines()
+    record.write_text("\n".join([lines[0], "{", ""]))
+    with pytest.raises(InputError, match=r"walks.jsonl, line 2: a row of a tuning on walks"):
+        walks.tune_on_walks(Here(), one, walks=6)
+
+
+def test_weights_in_the_folder_that_have_other_numbers_are_refused_in_one_line(toy):
+    walks.tune_on_walks(Here(), one := toy(), walks=6)
+    path = walks.weights_path(one.folder, 1)
+    wide = load_weights(path)._replace(others={"footstep_width": np.array(0.07)})
+    save_weights(path, wide)
+    words = "1.json: others must be those of the start, none; got footstep_width"
+    with pytest.raises(InputError, match=words):
+        walks.tune_on_walks(Here(), one, walks=6)

@@ -16,9 +16,10 @@ from typing import NamedTuple
 import numpy as np
 
 from hector_jax.control.weights import Weights
-from hector_jax.control.weights_file import save_weights
+from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError
+from hector_jax.core.tree_file import tree_hash
 from hector_jax.walk_tuning import walks
 from hector_jax.walk_tuning.campaign import Campaign
 from hector_jax.walk_tuning.walk_log import ScoredLog, evaluate_log, read_log
@@ -31,7 +32,8 @@ _CLEAR = 2.0  # standard deviations of a change that is no chance
 class Again(NamedTuple):
     """What the walks of the best set tell that did not choose it."""
 
-    change: float  # [%] mean change of log L against the start
+    # [%] mean change of log L against the start, over the cases in which all stood; None: no case
+    change: float | None
     clear: bool  # against the spread of its walks
 
 
@@ -59,21 +61,24 @@ def read_reports(pool: Executor, campaign: Campaign) -> Reports:
         raise InputError(f"{campaign.folder}: {tuning.reason}; tune from another")
     if tuning.waiting is not None:
         return Reports(tuning, tuning.waiting, number, None)
-    best, again = tuning.sets[tuning.best], []
+    best, again = tuning.sets[tuning.best].weights, []
     while all(path.exists() for path in walks.log_paths(campaign, number)):
-        again.append(np.array([score.loss for score, _ in ask(number, best.weights)]))
+        walked = load_weights(walks.weights_path(campaign.folder, number), campaign.robot)
+        if tree_hash(walked) == tree_hash(best):  # else a step of a tuning by another loss
+            again.append(np.array([score.loss for score, _ in ask(number, best)]))
         number += 1
-    path = walks.weights_path(campaign.folder, number)
-    if not path.exists():
-        save_weights(path, best.weights)
-    return Reports(tuning, best.weights, number, _again(tuning, again) if again else None)
+    save_weights(walks.weights_path(campaign.folder, number), best)
+    return Reports(tuning, best, number, _again(tuning, again) if again else None)
 
 
 def _again(tuning: WalkTuning, again: Sequence[np.ndarray]) -> Again:
-    start, best = (np.log(tuning.sets[i].losses).mean() for i in (0, tuning.best))
-    logs = np.array([np.log(losses).mean() for losses in again])
+    chosen = [tuning.sets[0].losses, tuning.sets[tuning.best].losses]
+    stood = np.isfinite([*chosen, *again]).all(axis=0)
+    if not stood.any():
+        return Again(None, False)
+    start, best, *logs = np.log([*chosen, *again])[:, stood].mean(axis=1)
     spread = np.std([best, *logs], ddof=1) * np.sqrt(1.0 + 1.0 / len(logs))
-    change = logs.mean() - start
+    change = np.mean(logs) - start
     return Again(100.0 * float(np.expm1(change)), bool(abs(change) > _CLEAR * spread))
 
 

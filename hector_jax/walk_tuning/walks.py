@@ -13,7 +13,7 @@ uses is in a folder, so that it begins anew in each call and no walk is made twi
 """
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, as_completed
 from dataclasses import replace
 from functools import partial
 from itertools import repeat
@@ -157,6 +157,9 @@ class _Walks:
         if not path.exists():
             save_weights(path, trial)
         there = load_weights(path, self.campaign.robot)
+        if there.others.keys() != trial.others.keys():
+            names, got = (", ".join(sorted(w.others)) or "none" for w in (trial, there))
+            raise InputError(f"{path}: others must be those of the start, {names}; got {got}")
         if jax.tree.all(jax.tree.map(np.array_equal, there, trial)):
             return state
         steps = parameters.steps_between(state.start, there, config.others)
@@ -232,11 +235,14 @@ def tune_on_walks(
     sets: list[WalkedSet] = []
     with bar(f"tuning on walks, {plural(cases, 'case')}") as report_progress:
 
+        def write_record() -> None:
+            rows = ({"losses": x.losses.tolist(), "accepted": x.accepted} for x in sets)
+            write_rows(campaign.folder / RECORD, [head, *rows])
+
         def on_iteration(iteration: Iteration) -> None:
             losses = objective.losses[-1]
             sets.append(WalkedSet(iteration.weights, losses, bool(iteration.accepted)))
-            rows = ({"losses": x.losses.tolist(), "accepted": x.accepted} for x in sets)
-            write_rows(campaign.folder / RECORD, [head, *rows])
+            write_record()
             report_progress(len(sets), config.iterations + 1, _progress(campaign, sets))
 
         report_progress(0, config.iterations + 1, "compiling")
@@ -244,6 +250,7 @@ def tune_on_walks(
             parts = objective.evaluate, objective.matrix, objective.place
             tuning = difftune.descend(config, campaign.start, Objective(*parts), on_iteration)
         except Waiting:
+            write_record()  # without sets whose report was undone
             waiting = load_weights(weights_path(campaign.folder, len(sets)), campaign.robot)
             return WalkTuning(sets, waiting, "")
         except InputError:
@@ -288,9 +295,9 @@ def walk_all(
     empty = log_of(no_samples(len(robot.joint_lower), len(robot.foot_point)))
     like = LogScore(0.0, 0.0), empty
     missing = [case for case, path in enumerate(paths) if not path.exists()]
-    walked = pool.map(walk_case, repeat(campaign), repeat(weights), missing)
-    for case, scored in zip(missing, walked, strict=True):
-        save_tree(paths[case], scored, kind="log", robot=robot)
+    running = {pool.submit(walk_case, campaign, weights, case): case for case in missing}
+    for job in as_completed(running):
+        save_tree(paths[running[job]], job.result(), kind="log", robot=robot)
     return [load_tree(path, like, kind="log", robot=robot)[0] for path in paths]
 
 
