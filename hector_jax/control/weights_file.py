@@ -45,8 +45,8 @@ def save_weights(path: Path, weights: Weights, schema: str | None = None) -> Non
 def best(robot: Robot | None = None) -> Weights:
     """Read the tuned weights shipped with a robot: `ROBOT-best.json` beside its ROBOT.toml.
 
-    HECTOR's, which are the default, are the row `best` of `hector tune --traj all`, including the
-    limit of the position error and the width of the steps (docs/results.md).
+    HECTOR's, which are the default, are of a tuning for all trajectories on drawn models alone, with
+    the limit of the position error and the width of the steps (docs/results.md).
 
     Raises:
         InputError: one line, if the robot has no such file or the file is invalid.
