@@ -1,5 +1,6 @@
 """Gradient and Gauss-Newton matrix by the steps of a tuning against differences; its words."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -8,11 +9,22 @@ import numpy as np
 import pytest
 from model import ANCHOR, PLAIN, ROBOT, mean_of
 
+from hector_jax.control import MpcConfig, Squares, StateCost
 from hector_jax.control.parameters import gradient_by_steps, stepped
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import direction_names, expert
+from hector_jax.control.weights_file import load_weights, save_weights
+from hector_jax.core.inputs import InputError
 from hector_jax.tuning.curvature import determined, least_squares_jit
-from hector_jax.tuning.difftune import TuneConfig, init, model_objective, trial_weights, update
+from hector_jax.tuning.difftune import (
+    TuneConfig,
+    init,
+    model_objective,
+    trial_weights,
+    tune,
+    tune_step,
+    update,
+)
 from hector_jax.tuning.evaluate import evaluate_jit
 from hector_jax.tuning.loss import PAPER_LOSS, losses, residuals, total
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
@@ -106,6 +118,37 @@ def test_loss_and_gradient_come_with_the_matrix():
     expected = gradient_by_steps(at, evaluation.gradient, OTHERS)
     assert float(found.loss) == pytest.approx(float(evaluation.loss), rel=1e-12)
     np.testing.assert_allclose(found.gradient, expected, rtol=1e-7, atol=1e-7 * abs(expected).max())
+
+
+def speed(step):
+    """A cost of one's own: the velocity ahead, at 0.3 m/s whatever the command."""
+    return Squares(step.state.velocity[:1], target=0.3, weight=2.0)
+
+
+def test_the_weight_of_a_cost_of_ones_own_is_tuned_and_saved(tmp_path):
+    walk = replace(CONFIG.rollout.walk, mpc=MpcConfig(costs=(StateCost("speed", of=speed),)))
+    config = TuneConfig(RolloutConfig(walk, ticks=24), others=("cost_speed",), iterations=2)
+    scenario = Scenario(ROBOT, named_command("c"), ANCHOR, PLAIN)
+    found = tune(config, scenario, expert())
+    first = found.iterations[0]
+    slope = gradient_by_steps(first.weights, first.evaluation.gradient, config.others)[-1]
+    at = [
+        float(
+            tune_step(
+                config, scenario, stepped(first.weights, h * np.eye(19)[18], config.others)
+            ).loss
+        )
+        for h in (1e-5, -1e-5)
+    ]
+    assert float(slope) == pytest.approx((at[0] - at[1]) / 2e-5, rel=1e-5)
+    assert abs(np.log(found.weights.others["cost_speed"])) > 0.1
+    save_weights(tmp_path / "mine.json", found.weights)
+    again = load_weights(tmp_path / "mine.json", ROBOT)
+    assert again.others["cost_speed"] == found.weights.others["cost_speed"]
+    with pytest.raises(InputError, match=r"unknown cost of the MPC 'cost_speed'"):
+        CONFIG.rollout.walk.parameters(again)
+    with pytest.raises(InputError, match=r"unknown tunable 'cost_sped'; did you mean 'cost_speed'"):
+        replace(config, others=("cost_sped",))
 
 
 # What the walks determine

@@ -169,10 +169,19 @@ class Squares(NamedTuple):
 
 
 class Cost(Part):
-    """Cost of the MPC beside Q and R."""
+    """Cost of the MPC beside Q and R; a factor on its weight can be tuned as `cost_NAME`."""
 
     on: ClassVar[str]
     of: Callable[..., Squares]
+
+    def times(self, factor: Any) -> "Cost":
+        """Return the cost with a factor on its weight."""
+
+        def of(argument: Any) -> Squares:
+            squares = self.of(argument)
+            return squares._replace(weight=factor * squares.weight)
+
+        return type(self)(str(self), of=of)
 
 
 class InputCost(Cost):

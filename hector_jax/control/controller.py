@@ -21,14 +21,14 @@ from hector_jax.control.footstep import Feet, FootstepConfig, FootstepParameters
 from hector_jax.control.gait import PATTERNS, GaitConfig
 from hector_jax.control.legs import LegConfig, LegParameters, Measurement
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
-from hector_jax.control.parameters import TUNABLES, Parameters
+from hector_jax.control.parameters import COST, Parameters, tunable
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.slip import Grip, SlipConfig, feel, first_grip
 from hector_jax.control.twin import ReferenceInputs, TwinConfig
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rotation_from_euler, wrap_angle
-from hector_jax.core.inputs import InputError, short_repr
+from hector_jax.core.inputs import InputError, short_repr, unknown
 from hector_jax.core.settings import check, from_table
 from hector_jax.core.trajectory import Disturbance, State, Wrench
 from hector_jax.qp import Solution
@@ -61,14 +61,17 @@ class WalkConfig:
         mpc = self.mpc.parameters(weights._replace(others={}))
         parameters = Parameters(mpc, self.footstep.parameters, self.legs.parameters)
         for name, value in weights.others.items():
-            parameters = TUNABLES[name].write(parameters, value)
+            if name.startswith(COST) and name.removeprefix(COST) not in mpc.costs:
+                costs = (f"{COST}{cost}" for cost in mpc.costs)
+                raise InputError(unknown("cost of the MPC", name, costs))
+            parameters = tunable(name).write(parameters, value)
         return parameters
 
     def with_others(self, weights: Weights, names: Iterable[str]) -> Weights:
         """Return the weights with `others` of these names added from this config if missing."""
         parameters = self.parameters(weights)
         missing = [name for name in names if name not in weights.others]
-        added = {name: np.asarray(TUNABLES[name].read(parameters), float) for name in missing}
+        added = {name: np.asarray(tunable(name).read(parameters), float) for name in missing}
         return weights._replace(others={**weights.others, **added})
 
     @property

@@ -14,7 +14,7 @@ foot in the air has no M_z; the reference may be shifted, see `controller`; also
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, NamedTuple
@@ -57,6 +57,7 @@ class MpcParameters(NamedTuple):
     effort_reference: Any  # share of the robot's weight in the force reference of R
     position_limit: Any  # [m] see `controller.limit_distance`
     integral: IntegralGains
+    costs: Mapping[str, Any] = {}  # factors on the weights of the own costs, by name
 
 
 class _Default(tuple):
@@ -111,6 +112,7 @@ class MpcConfig:
             effort_reference=float(self.effort_reference == "gravity"),
             position_limit=math.inf if self.position_limit is None else self.position_limit,
             integral=IntegralGains(*gains),
+            costs={str(cost): 1.0 for cost in self.costs},
         )
 
     def planned_inertia(self, inertia: Float[Any, "3 3"]) -> Float[Any, "3 3"]:
@@ -349,12 +351,17 @@ def state_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> 
 
 def own_costs(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> Squares:
     """Return the costs beside Q and R as functions of the inputs, dense: A is (rows, n)."""
-    found = []
-    if parts := [cost for cost in config.costs if cost.on == "inputs"]:
+    found, factors = [], problem.parameters.costs
+
+    def on(what: str) -> list[Cost]:
+        costs = (cost for cost in config.costs if cost.on == what)
+        return [cost.times(factors[str(cost)]) for cost in costs]
+
+    if parts := on("inputs"):
         A, target, weight = _on_contacts(config, problem, condensed, parts)
         stands = condensed.feet.sum(axis=-1)[..., None]
         found.append((block_diagonal(A), target.ravel(), (stands * weight).ravel()))
-    if parts := [cost for cost in config.costs if cost.on == "states"]:
+    if parts := on("states"):
         A, constant, target, weight = _on_states(problem, condensed, parts)
         found.append((A, target - constant, weight))
     return Squares(*map(jnp.concatenate, zip(*found, strict=True)))

@@ -56,6 +56,7 @@ class Tunable(NamedTuple):
     lower: float
     upper: float
     each_joint: bool = False  # an array with a number for each joint of a leg, else a scalar
+    cost: str = ""  # the factor on the weight of this cost of one's own, stepped in logarithms
 
     @property
     def of_legs(self) -> bool:
@@ -74,10 +75,13 @@ class Tunable(NamedTuple):
 
     def read(self, parameters: Parameters) -> Any:
         """Return the entry: a number or a tree of numbers."""
-        return attrgetter(self.path)(parameters)
+        found = attrgetter(self.path)(parameters)
+        return found[self.cost] if self.cost else found
 
     def write(self, parameters: Parameters, value: Any) -> Parameters:
         """Return the parameters with another value of the entry."""
+        if self.cost:
+            value = {**attrgetter(self.path)(parameters), self.cost: value}
 
         def replace(tree: Any, names: Sequence[str]) -> Any:
             first, *rest = names
@@ -108,6 +112,16 @@ TUNABLES = {
 """Numbers that can be tuned in addition to Q and R, by their names in `Weights.others`.
 
 A new one is added here and to the choices in cli/flags.py."""
+COST = "cost_"
+"""Begins the name of the factor on the weight of a cost of one's own, which is a tunable too."""
+
+
+def tunable(name: str) -> Tunable:
+    """Return the tunable of a name in `Weights.others`; KeyError if there is none."""
+    if name.startswith(COST):
+        return Tunable("mpc.costs", 1e-3, 1e3, cost=name.removeprefix(COST))
+    return TUNABLES[name]
+
 
 _FOOTSTEPS = ("footstep_feedback", "turn_lead")
 _INTEGRAL = ("horizontal_gain", "height_gain", "tilt_gain", "yaw_gain")
@@ -133,7 +147,7 @@ def tunables(names: Iterable[str]) -> tuple[str, ...]:
 
 def out_of_box(name: str, start: Any) -> str:
     """Return why a tuning of a number cannot start at a value; empty if it can."""
-    box = Range(TUNABLES[name].lower, TUNABLES[name].upper)
+    box = Range(tunable(name).lower, tunable(name).upper)
     if all(number in box for number in np.ravel(start).tolist()):
         return ""
     return f"{name} starts at {start}, expected {box}"
@@ -154,7 +168,7 @@ def bounds(others: Iterable[str] = (), like: Weights | None = None) -> tuple[Wei
         return Weights(
             jax.tree.map(lambda w: np.full(np.shape(w), getattr(Q, side)), like.Q),
             jax.tree.map(lambda w: np.full(np.shape(w), getattr(R, side)), like.R),
-            {name: getattr(TUNABLES[name], side) for name in others},
+            {name: getattr(tunable(name), side) for name in others},
         )
 
     return bound("lower"), bound("upper")
@@ -173,7 +187,7 @@ def stepped(
     Args:
         start: with all feet sharing one R.
         steps: log-steps in the `weights.directions`, then of each of `others`, entry by entry, as
-            shares of their boxes.
+            shares of their boxes; log-steps of factors of costs.
         others: names of numbers in `start.others`.
 
     >>> start = nominal()._replace(others={"turn_lead": 0.5})
@@ -184,7 +198,9 @@ def stepped(
     moved = dict(start.others)
     for name in others:
         part, rest = jnp.split(rest, [np.size(moved[name])])
-        moved[name] = moved[name] + part.reshape(np.shape(moved[name])) * TUNABLES[name].width
+        part, of = part.reshape(np.shape(moved[name])), tunable(name)
+        logs = moved[name] * jnp.exp(part)
+        moved[name] = logs if of.cost else moved[name] + part * of.width
     return scale_weights(start, of_weights)._replace(others=moved)
 
 
@@ -194,7 +210,12 @@ def steps_between(
     """Return the steps from a start to weights: the inverse of `stepped`."""
     first_foot = directions(start).argmax(axis=1)  # index of each direction's first weight
     logs = jnp.log(weights_to_vector(weights) / weights_to_vector(start))[first_foot]
-    away = [(weights.others[n] - start.others[n]) / TUNABLES[n].width for n in others]
+
+    def away_of(name: str) -> Any:
+        at, before, of = weights.others[name], start.others[name], tunable(name)
+        return jnp.log(at / before) if of.cost else (at - before) / of.width
+
+    away = [jnp.asarray(away_of(name)) for name in others]
     return jnp.concatenate([logs, *map(jnp.ravel, away)])
 
 

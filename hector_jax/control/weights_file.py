@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hector_jax.control.parameters import TUNABLES
+from hector_jax.control.parameters import COST, TUNABLES, tunable
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, unknown
@@ -45,8 +45,8 @@ def save_weights(path: Path, weights: Weights, schema: str | None = None) -> Non
 def best(robot: Robot | None = None) -> Weights:
     """Read the tuned weights shipped with a robot: `ROBOT-best.json` beside its ROBOT.toml.
 
-    HECTOR's, which are the default, are of a tuning for all trajectories on drawn models alone, with
-    the limit of the position error and the width of the steps (docs/results.md).
+    HECTOR's, which are the default, are tuned for all trajectories on drawn models alone, with the
+    limit of the position error and the width of the steps (docs/results.md).
 
     Raises:
         InputError: one line, if the robot has no such file or the file is invalid.
@@ -80,7 +80,10 @@ def load_weights(path: Path, robot: Robot | None = None) -> Weights:
         part: {n: (w.shape, WEIGHTS) for n, w in getattr(like, part)._asdict().items() if w.size}
         for part in ("Q", "R")
     }
-    others = {n: (x.shape(robot), Range(x.lower, x.upper)) for n, x in TUNABLES.items()}
+    given = tree.get("others") if isinstance(tree, dict) else None
+    costs = [n for n in given if n.startswith(COST)] if isinstance(given, dict) else []
+    numbers = {name: tunable(name) for name in (*TUNABLES, *costs)}
+    others = {n: (x.shape(robot), Range(x.lower, x.upper)) for n, x in numbers.items()}
     _check_keys(path, tree, (*parts, "others", "$schema"), parts)  # a schema is for editors
     values = {}
     for part, entries in {**parts, "others": others}.items():

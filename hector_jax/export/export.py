@@ -16,7 +16,7 @@ import numpy as np
 from hector_jax.control.contact import LINE_FRICTION
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.mpc import input_weights
-from hector_jax.control.parameters import TUNABLES
+from hector_jax.control.parameters import COST, TUNABLES, tunable
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.control.weights_file import WEIGHTS, weights_tree
@@ -189,9 +189,15 @@ def weights_schema(robot: Robot | None = None) -> dict[str, Any]:
         name: _schema(np.zeros(number.shape(robot)).tolist(), Range(number.lower, number.upper))
         for name, number in TUNABLES.items()
     }
+    factor = tunable(COST)
     schema["properties"] |= {
         "$schema": {"type": "string"},
-        "others": {"type": "object", "properties": others, "additionalProperties": False},
+        "others": {
+            "type": "object",
+            "properties": others,
+            "patternProperties": {f"^{COST}": _schema(1.0, Range(factor.lower, factor.upper))},
+            "additionalProperties": False,
+        },
     }
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

@@ -85,9 +85,10 @@ class TuneConfig:
 
 def _why_not_tunable(walk: WalkConfig, name: str) -> str:
     """Return why gradients of the rigid-body model cannot tune a number; empty if they can."""
-    if name not in parameters.TUNABLES:
-        return unknown("tunable", name, parameters.TUNABLES)
-    tunable = parameters.TUNABLES[name]
+    costs = [f"{parameters.COST}{cost}" for cost in walk.mpc.costs]
+    if name not in (*parameters.TUNABLES, *costs):
+        return unknown("tunable", name, (*parameters.TUNABLES, *costs))
+    tunable = parameters.tunable(name)
     if tunable.of_legs:
         return (
             f"{name} cannot be tuned by gradients: the rigid-body model has no joints, so its "
