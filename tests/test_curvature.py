@@ -132,14 +132,9 @@ def test_the_weight_of_a_cost_of_ones_own_is_tuned_and_saved(tmp_path):
     found = tune(config, scenario, expert())
     first = found.iterations[0]
     slope = gradient_by_steps(first.weights, first.evaluation.gradient, config.others)[-1]
-    at = [
-        float(
-            tune_step(
-                config, scenario, stepped(first.weights, h * np.eye(19)[18], config.others)
-            ).loss
-        )
-        for h in (1e-5, -1e-5)
-    ]
+    steps = 1e-5 * np.eye(19)[18] * np.array([[1.0], [-1.0]])
+    moved = (stepped(first.weights, step, config.others) for step in steps)
+    at = [float(tune_step(config, scenario, weights).loss) for weights in moved]
     assert float(slope) == pytest.approx((at[0] - at[1]) / 2e-5, rel=1e-5)
     assert abs(np.log(found.weights.others["cost_speed"])) > 0.1
     save_weights(tmp_path / "mine.json", found.weights)

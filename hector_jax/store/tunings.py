@@ -47,7 +47,7 @@ from hector_jax.tuning.evaluate import (
 )
 from hector_jax.tuning.loss import loss_of_robot
 from hector_jax.tuning.rollout import Scenario, rollout, rollout_config
-from hector_jax.tuning.status import StepStatus, status_text
+from hector_jax.tuning.status import StepStatus
 from hector_jax.tuning.variation import drawn_variation
 
 # modules that determine the numbers, for `content_key`
@@ -301,20 +301,6 @@ def mean_norms(setup: Setup, problems: Mapping[str, Problem]) -> dict[str, dict[
         running = {n: pool.submit(_norms_job, config, robot, p) for n, p in problems.items()}
         report_progress(0, len(problems), "compiling")
         return {name: future.result() for name, future in running.items()}
-
-
-def relative_matrix(setup: Setup, start: Weights, problem: Problem) -> Float[np.ndarray, "n n"]:
-    """Return the Gauss-Newton matrix divided by the loss, mean over the commands.
-
-    It is empty, for an unknown curvature, if the model cannot walk with these weights.
-    """
-    objective = _objective(setup, start, problem)
-    evaluation = objective.evaluate(start)
-    status = StepStatus(int(step_status(setup.config, evaluation)))
-    if why := status_text(status, evaluation):
-        say(f"the curvature of the loss at the start is not known: on the model {why}")
-        return np.zeros((0, 0))
-    return np.asarray(objective.matrix(start)) / float(evaluation.loss)
 
 
 def tune_config(robot: Robot, **settings: Any) -> TuneConfig:
