@@ -16,7 +16,6 @@ from jaxtyping import Float
 from hector_jax.control.parameters import stepped, steps_between
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
-from hector_jax.core.trajectory import Trajectory
 from hector_jax.tuning.evaluate import Walk
 from hector_jax.tuning.loss import Loss, residuals
 from hector_jax.tuning.rollout import RolloutConfig, rollout
@@ -56,17 +55,7 @@ class Determined(NamedTuple):
         return [name for name, share in self.weights.items() if share < 0.5]
 
 
-class LeastSquares(NamedTuple):
-    """The loss of a walk on the model, as a sum of squares to first order in the steps."""
-
-    loss: Float[Array, "*batch"]
-    gradient: Float[Array, "*batch n"]
-    matrix: Float[Array, "*batch n n"]  # Gauss-Newton
-    fallen: Float[Array, "*batch"]  # share of the ticks after a fall
-    residual: Float[Array, "*batch"]  # largest of a QP
-
-
-def least_squares(
+def gauss_newton(
     config: RolloutConfig,
     scenario: Any,
     weights: Weights,
@@ -74,10 +63,10 @@ def least_squares(
     *,
     walk: Walk = rollout,
     others: tuple[str, ...] = (),
-) -> LeastSquares:
-    """Compute loss, gradient and Gauss-Newton matrix of a rollout, in forward mode.
+) -> Float[Array, "n n"]:
+    """Compute the Gauss-Newton matrix of the loss of a rollout, in forward mode.
 
-    With the residuals r and their derivative J these are r'r, 2 J'r and 2 J'J.
+    It is 2 J'J, where J is the derivative of the residuals.
 
     Args:
         config, scenario, walk: of the rollout, see `evaluate`.
@@ -86,34 +75,20 @@ def least_squares(
         others: names of numbers beside Q and R.
 
     Returns:
-        Gradient and matrix in the n coordinates of `parameters.stepped`.
+        The matrix in the n coordinates of `parameters.stepped`.
     """
     zero = jnp.zeros(len(steps_between(weights, weights, others)))
 
-    def moved(steps: Float[Array, " n"]) -> tuple[Float[Array, " rows"], Trajectory]:
-        trajectory = walk(config, scenario, stepped(weights, steps, others))
-        return residuals(loss, trajectory), trajectory
+    def rows(steps: Float[Array, " n"]) -> Float[Array, " rows"]:
+        return residuals(loss, walk(config, scenario, stepped(weights, steps, others)))
 
-    def tangent_of(direction: Float[Array, " n"]) -> tuple:
-        return jax.jvp(moved, (zero,), (direction,), has_aux=True)
-
-    rows, J, trajectory = jax.vmap(tangent_of, out_axes=(None, 0, None))(jnp.eye(len(zero)))
-    fallen, residual = jnp.mean(1.0 * trajectory.fallen), jnp.max(trajectory.residual)
-    return LeastSquares(rows @ rows, 2.0 * J @ rows, 2.0 * J @ J.T, fallen, residual)
+    along = jax.vmap(lambda direction: jax.jvp(rows, (zero,), (direction,))[1])
+    J = along(jnp.eye(len(zero)))
+    return 2.0 * J @ J.T
 
 
-def gauss_newton(
-    config: RolloutConfig, scenario: Any, weights: Weights, loss: Loss, **options: Any
-) -> Float[Array, "n n"]:
-    """Return the matrix of `least_squares`."""
-    return least_squares(config, scenario, weights, loss, **options).matrix
-
-
-least_squares_jit, gauss_newton_jit = (
-    jax.jit(function, static_argnums=0, static_argnames=("walk", "others"))
-    for function in (least_squares, gauss_newton)
-)
-"""`least_squares` and `gauss_newton`, compiled once per rollout and set of terms."""
+gauss_newton_jit = jax.jit(gauss_newton, static_argnums=0, static_argnames=("walk", "others"))
+"""`gauss_newton`, compiled once per rollout and set of terms."""
 
 
 def determined(

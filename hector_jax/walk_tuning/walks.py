@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float
 
 from hector_jax.control import parameters
 from hector_jax.control.reference import standing_anchor
-from hector_jax.control.weights import Weights, direction_names
+from hector_jax.control.weights import Weights
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.console import bar
 from hector_jax.core.environment import code_hash
@@ -243,7 +243,7 @@ def tune_on_walks(
             losses = objective.losses[-1]
             sets.append(WalkedSet(iteration.weights, losses, bool(iteration.accepted)))
             write_record()
-            report_progress(len(sets), config.iterations + 1, _progress(campaign, sets))
+            report_progress(len(sets), config.iterations + 1, _progress(sets))
 
         report_progress(0, config.iterations + 1, "compiling")
         try:
@@ -312,12 +312,6 @@ def log_paths(campaign: Campaign, number: int) -> list[Path]:
     return [campaign.folder / "logs" / name for name in names]
 
 
-def _progress(campaign: Campaign, sets: Sequence[WalkedSet]) -> str:
+def _progress(sets: Sequence[WalkedSet]) -> str:
     accepted = max((i for i, x in enumerate(sets) if x.accepted), default=0)
-    if not accepted:
-        return "the start has walked"
-    weights = sets[accepted].weights
-    logs = np.asarray(parameters.steps_between(campaign.start, weights))
-    moved = sorted(zip(direction_names(weights), logs, strict=True), key=lambda x: -abs(x[1]))[:3]
-    factors = ", ".join(f"{name} {np.exp(log):.2g} times" for name, log in moved)
-    return f"L {changes(sets)[accepted] or 0.0:+.0f} % against the start; {factors}"
+    return f"L {changes(sets)[accepted] or 0.0:+.0f} % against the start"
