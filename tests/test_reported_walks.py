@@ -239,7 +239,9 @@ def test_the_first_report_can_be_undone_and_another_one_cannot(folder, capsys):
     """The start fell in all: a tuning has nowhere to begin, and another log may."""
     next_walk(folder, ("ahead",))
     before = content(folder)
-    with pytest.raises(InputError, match="weights cannot be tuned from: the robot fell"):
+    with pytest.raises(
+        InputError, match="robot: the start fell or was not solved in all walks; tune from another"
+    ):
         report(folder, plain("ahead", fall_at=0.04))
     report(folder, undo=True)
     undone = result(capsys)

@@ -196,9 +196,9 @@ class Tune(Configured, ByWalker, Parallel):
     verdict: bool = False  # print up to 12 walks more: in other engines, or with other masses
     # walks to spend on row `best` after its tuning on the model; 0 for none; by default three sets
     # walk on eight drawn plants (docs/howto/walks.md)
-    walks: Annotated[int, Range(0, 100_000)] | None = None
+    walks: Annotated[int | None, Range(0, 100_000)] = None
     # drawn plants of these walks, 0 for the simulator; by default so that eight sets can walk
-    walk_plants: Annotated[int, Range(0, 1000)] | None = None
+    walk_plants: Annotated[int | None, Range(0, 1000)] = None
     walk_engine: WalkEngine = "c"  # of these walks; c: MuJoCo; extras: drake, pinocchio
     json: bool = False  # print JSON instead of the table; `run` is the folder
     robot: RobotFile = None  # TOML file of another robot, with its data in DATA/NAME; or HECTOR
