@@ -105,15 +105,10 @@ class MpcConfig:
     def parameters(self, weights: Weights) -> MpcParameters:
         """Return the traced numbers."""
         gains = self.horizontal_gain, self.height_gain, self.tilt_gain, self.yaw_gain
-        return MpcParameters(
-            weights,
-            friction=self.friction,
-            max_force=self.max_force,
-            effort_reference=float(self.effort_reference == "gravity"),
-            position_limit=math.inf if self.position_limit is None else self.position_limit,
-            integral=IntegralGains(*gains),
-            costs={str(cost): 1.0 for cost in self.costs},
-        )
+        limit = math.inf if self.position_limit is None else self.position_limit
+        numbers = self.friction, self.max_force, float(self.effort_reference == "gravity"), limit
+        costs = {str(cost): 1.0 for cost in self.costs}
+        return MpcParameters(weights, *numbers, IntegralGains(*gains), costs)
 
     def planned_inertia(self, inertia: Float[Any, "3 3"]) -> Float[Any, "3 3"]:
         """Return the inertia [kg m^2] that the plan turns, from that of the whole robot."""
@@ -351,17 +346,13 @@ def state_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> 
 
 def own_costs(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> Squares:
     """Return the costs beside Q and R as functions of the inputs, dense: A is (rows, n)."""
-    found, factors = [], problem.parameters.costs
-
-    def on(what: str) -> list[Cost]:
-        costs = (cost for cost in config.costs if cost.on == what)
-        return [cost.times(factors[str(cost)]) for cost in costs]
-
-    if parts := on("inputs"):
+    factors = problem.parameters.costs
+    costs, found = [cost.times(factors[str(cost)]) for cost in config.costs], []
+    if parts := [cost for cost in costs if cost.on == "inputs"]:
         A, target, weight = _on_contacts(config, problem, condensed, parts)
         stands = condensed.feet.sum(axis=-1)[..., None]
         found.append((block_diagonal(A), target.ravel(), (stands * weight).ravel()))
-    if parts := on("states"):
+    if parts := [cost for cost in costs if cost.on == "states"]:
         A, constant, target, weight = _on_states(problem, condensed, parts)
         found.append((A, target - constant, weight))
     return Squares(*map(jnp.concatenate, zip(*found, strict=True)))
