@@ -51,11 +51,10 @@ PACKAGES = {  # in this order: title and purpose of each page of the reference
     "sim": ("Simulation", "The robot in MuJoCo, one walk at a time or in batches."),
     "grfm": ("Ground reaction net", "phi: the map from command to effect, its data and training."),
     "tuning": ("Tuning", "Rollout, loss and Gauss-Newton steps, for one problem or for many."),
-    "search": ("Search", "Which weights to walk next, from the walks so far."),
     "store": ("Store", "What is computed once and kept: walks, nets, tunings, runs."),
     "verdict": ("Verdict", "Walks of weight sets, scores and their statistics."),
     "importing": ("Importing", "The settings of robots that others publish, by rules."),
-    "walk_tuning": ("Tuning on walks", "Proposals, logs of walks and their record."),
+    "walk_tuning": ("Tuning on walks", "The tuning whose value is walks; their logs and record."),
     "export": ("Export", "Weights and controller as files for a robot's computer."),
     "report": ("Report", "Tables, pictures, films and pages of a run."),
 }
@@ -67,11 +66,10 @@ PUBLIC = {  # of packages without `__all__`, in whichever of their modules they 
     "grfm": "Window Effect Phi as_effect load_net save_net TrainConfig train",
     "tuning": """RolloutConfig rollout LossTerm losses with_alphas TuneConfig Evaluation Tuning
         tune descend""",
-    "search": "Model Space WalkResult Proposal propose",
     "store": "load_run load_walks",
     "verdict": "Score score Verdict make_verdict",
     "importing": "propose_robot standard_form",
-    "walk_tuning": "Campaign tune_on_walks",
+    "walk_tuning": "Campaign WalkTuning tune_on_walks",
     "export": "export",
     "report": "compare_runs write_film",
 }
