@@ -100,7 +100,7 @@ def contest_job(
         return jax.device_get(weights_after(campaign.start, steps))
 
     def walk(steps: Float[np.ndarray, " n"]) -> float:
-        losses.append(walk_case(campaign, weights_at(steps), 0)[0].loss)
+        losses.append(walk_case(campaign, weights_at(steps), 0).loss)
         return float(np.log(losses[-1] / at_start))
 
     def model(steps: Float[np.ndarray, " n"]) -> float:

@@ -30,7 +30,8 @@ from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import load_robot
 from hector_jax.store import nets, tunings
 from hector_jax.store.setup import Setup
-from hector_jax.verdict import choice, judging
+from hector_jax.verdict import judging
+from hector_jax.walk_tuning import best_set
 
 FIRST_SEED = 7100
 PROBLEMS = {**{name: (name,) for name in COMMANDS}, "all": COMMANDS}
@@ -72,7 +73,7 @@ def walk_robot(flags: Flags, pool: Executor, name: str, file: Path | None) -> Lo
         )
         sets |= {(key, ridge): found.weights for key, found in tuned.items()}
     setup = Setup(pool, tunings.tune_config(robot), robot)
-    plants = choice.drawn_plants(robot, flags.plants, FIRST_SEED)
+    plants = best_set.drawn_plants(robot, flags.plants, FIRST_SEED)
     seeds = range(FIRST_SEED, FIRST_SEED + flags.plants)
     losses = {}
     for command in COMMANDS:

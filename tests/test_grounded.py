@@ -18,7 +18,7 @@ from hector_jax.tuning.evaluate import evaluate_jit
 from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
 from hector_jax.tuning.loss import PAPER_LOSS
 from hector_jax.tuning.rollout import Scenario
-from hector_jax.verdict.choice import drawn_plants
+from hector_jax.walk_tuning.best_set import drawn_plants
 
 SCENARIO = Scenario(ROBOT, AHEAD, ANCHOR, PLAIN)
 

@@ -24,13 +24,19 @@ from hector_jax.store import tunings
 from hector_jax.store.cache import robot_hash
 from hector_jax.store.folder import CONFIG, VERSIONS, flattened, read_object
 from hector_jax.store.nets import COLLECTION_CODE, load_trained
-from hector_jax.verdict import choice
+from hector_jax.walk_tuning import best_set
 
 F = TypeVar("F", bound=Flags)
 
 _REMEDY = "start a new run"
 TIME = "%Y%m%d-%H%M%S"  # names a run
-_CODE = (*COLLECTION_CODE, "grfm.training", "sim.standin", "verdict.choice", "walk_tuning.walks")
+_CODE = (
+    *COLLECTION_CODE,
+    "grfm.training",
+    "sim.standin",
+    "walk_tuning.best_set",
+    "walk_tuning.walks",
+)
 # flags of a call, not of the run that it begins or resumes
 _CALL_FLAGS = ("config", "each", "out", "resume", "runs")
 # flags that may change when a run is resumed
@@ -56,7 +62,7 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
             numbers that no gradient tunes; --net is not its net.
     """
     loaded = arguments.load_trajectories(args.traj, robot, "; add --each")
-    choice.walk_plants(robot, args.walk_plants, args.walks, len(loaded))
+    best_set.walk_plants(robot, args.walk_plants, args.walks, len(loaded))
     _check_walker(args)
     if args.net:
         load_trained(args.net, robot, args.variant)

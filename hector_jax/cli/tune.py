@@ -44,8 +44,9 @@ from hector_jax.store.setup import Setup
 from hector_jax.tuning.curvature import Determined, determined
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.evaluate import aligned
-from hector_jax.verdict import choice, judging, metrics
+from hector_jax.verdict import judging, metrics
 from hector_jax.verdict.judging import ScoredWalks
+from hector_jax.walk_tuning import best_set
 from hector_jax.walk_tuning.walks import Campaign, WalkTuning, tune_on_walks
 
 _ARTEFACTS = "kept"  # folder in it
@@ -88,7 +89,7 @@ class _Run(NamedTuple):
         """Settings and start of the tuning of `best`."""
         _, config, robot = self.setup
         smooth, safe = self.args.smooth, self.args.safe
-        return choice.settings_of_best(config, robot, self.start, smooth=smooth, safe=safe)
+        return best_set.settings_of_best(config, robot, self.start, smooth=smooth, safe=safe)
 
     @property
     def seconds(self) -> float:
@@ -180,7 +181,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         tunings=tuned.tunings,
         walks=tuned.walks,
         smooth=args.smooth,
-        draws=choice.DRAWS,
+        draws=best_set.DRAWS,
         **_draw(run, tuned, *walks[first.name]),
         config=settings,
         environment=made_with,
@@ -250,10 +251,10 @@ def _tune_sets(run: _Run, net: nets.TrainedNet) -> _Tuned:
     tune_in = partial(tunings.tune_all, folder=folder, metrics=run.folder / METRICS)
     title = f"tuning {run.name} without and with GRFM-Net"
     done = tune_in(setup, problems, title=title, start=run.start)
-    models = plural(choice.DRAWS * len(commands), "drawn model")
+    models = plural(best_set.DRAWS * len(commands), "drawn model")
     title = f"tuning {run.name} on {models}, for `best`"
     config, start = run.settings_of_best
-    problem = {"best": problems["with"]._replace(draws=choice.DRAWS)}
+    problem = {"best": problems["with"]._replace(draws=best_set.DRAWS)}
     of_best = setup._replace(config=config)
     done |= tune_in(of_best, problem, title=title, start=start, before=done)
     sets = {
@@ -282,8 +283,8 @@ def _save_sets(run: _Run, sets: Mapping[str, Weights]) -> None:
 def _campaign(run: _Run, start: Weights) -> tuple[Campaign, int]:
     """Return the tuning of `best` on walks, from the result of that on the model; its budget."""
     robot, args, (config, _) = run.setup.robot, run.args, run.settings_of_best
-    plants, budget = choice.walk_plants(robot, args.walk_plants, args.walks, len(run.commands))
-    config = replace(config, least_gain=choice.WALK_GAIN)
+    plants, budget = best_set.walk_plants(robot, args.walk_plants, args.walks, len(run.commands))
+    config = replace(config, least_gain=best_set.WALK_GAIN)
     inputs = run.folder / "walks", config, robot, start, run.commands, plants
     return Campaign(*inputs, arguments.engine_of(args)), budget
 

@@ -30,7 +30,8 @@ from hector_jax.sim.world import hfs
 from hector_jax.store import tunings
 from hector_jax.store.folder import RESULT
 from hector_jax.store.setup import Setup
-from hector_jax.verdict import choice, judging, metrics
+from hector_jax.verdict import judging, metrics
+from hector_jax.walk_tuning import best_set
 from hector_jax.walk_tuning.campaign import Campaign
 from hector_jax.walk_tuning.walks import tune_on_walks
 
@@ -115,11 +116,11 @@ def tune_walker(folder: Path, args: Tune) -> None:
     commands = {trajectory.name: trajectory.command for trajectory in trajectories}
     campaign = Campaign(
         folder / "walks",
-        replace(config, least_gain=choice.WALK_GAIN),
+        replace(config, least_gain=best_set.WALK_GAIN),
         robot,
         arguments.weights_by_name(args.start, robot),
         commands,
-        choice.walk_plants(robot, args.walk_plants, args.walks, len(commands))[0],
+        best_set.walk_plants(robot, args.walk_plants, args.walks, len(commands))[0],
         arguments.engine_of(args),
     )
     _check_first(args, campaign, seconds)

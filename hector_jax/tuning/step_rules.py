@@ -97,8 +97,9 @@ def boxed_step(ridge: float, state: StepState, box: Box, size: Any = None) -> Fl
     slope, curvature = _model(ridge, state)
     low, high = box[0] - state.steps, box[1] - state.steps
     size = state.size if size is None else size
-    held, step = jnp.zeros(len(slope), bool), jnp.zeros_like(slope)
-    for _ in range(_ROUNDS):
+
+    def again(_: Any, found: tuple[Array, Array]) -> tuple[Array, Array]:
+        held, step = found
         at = jnp.where(held, step, 0.0)
         free = jnp.where(held, 0.0, slope + curvature @ at)
         coupled = jnp.where(held[:, None] | held, 0.0, curvature) + jnp.diag(1.0 * held)
@@ -106,8 +107,10 @@ def boxed_step(ridge: float, state: StepState, box: Box, size: Any = None) -> Fl
         beyond, step = (step < low) | (step > high), jnp.clip(step, low, high)
         uphill = slope + curvature @ step
         outward = ((step <= low) & (uphill > 0.0)) | ((step >= high) & (uphill < 0.0))
-        held = beyond | (held & outward)
-    return step
+        return beyond | (held & outward), step
+
+    nothing = jnp.zeros(len(slope), bool), jnp.zeros_like(slope)
+    return jax.lax.fori_loop(0, _ROUNDS, again, nothing)[1]
 
 
 def _trusted_step(

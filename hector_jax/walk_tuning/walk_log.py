@@ -35,15 +35,11 @@ class Log(NamedTuple):
     belief: Belief  # zero in a log without it
 
 
-class LogScore(NamedTuple):
-    """Score of the log of one case."""
+class ScoredLog(NamedTuple):
+    """A log with its loss."""
 
     loss: float  # L; infinite if the robot fell or a QP was not solved
-    margin: float  # share of the way to a fall, of tilt and height; 1 where the loss is infinite
-
-
-ScoredLog = tuple[LogScore, Log]
-"""The score of a log, and the log at the plan interval."""
+    log: Log  # at the plan interval
 
 
 def log_of(trajectory: Trajectory) -> Log:
@@ -144,18 +140,12 @@ def tracking_errors(config: TuneConfig, robot: Robot, command: Command, log: Log
 
 
 def evaluate_log(config: TuneConfig, robot: Robot, command: Command, log: Log) -> ScoredLog:
-    """Return the score of a log against its command, and the log at the plan interval.
+    """Return a log at the plan interval, with its loss against its command.
 
     Source: Eq. 11.
     """
     tick = config.rollout.walk.gait.tick
     reference = reference_of(tick, robot, command, log)
     loss = float(loss_of(config.loss, trajectory_of(log)._replace(reference=reference)))
-    min_height, max_tilt = robot.description.limits
-    upright = ~log.fallen
-    tilt = np.abs(log.state.euler[upright, :2]).max(initial=0.0) / max_tilt
-    height = float(robot.standing_height)
-    sunk = (height - log.state.position[upright, 2].min(initial=height)) / (height - min_height)
     failed = log.fallen.any() or not log.residual.max() <= SOLVED
-    score = LogScore(np.inf, 1.0) if failed else LogScore(loss, float(max(tilt, sunk)))
-    return score, _at_ticks(log, tick)
+    return ScoredLog(np.inf if failed else loss, _at_ticks(log, tick))

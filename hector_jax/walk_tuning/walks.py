@@ -48,7 +48,6 @@ from hector_jax.tuning.status import StepStatus
 from hector_jax.walk_tuning.campaign import Campaign, walker_hash
 from hector_jax.walk_tuning.walk_log import (
     Log,
-    LogScore,
     ScoredLog,
     evaluate_log,
     log_of,
@@ -169,14 +168,14 @@ class _Walks:
         """Walk a set; value and slope of the mean of log L."""
         campaign, number = self.campaign, len(self.losses)
         logs = self.ask(number, weights)
-        losses = np.array([score.loss for score, _ in logs])
+        losses = np.array([walked.loss for walked in logs])
         stood = np.isfinite(losses)
         self.losses.append(losses)
         start = self.losses[0][np.isfinite(self.losses[0])]
         worst = np.exp(_FALL) * start.max(initial=1.0)
         value = float(np.exp(np.mean(np.log(np.where(stood, np.minimum(losses, worst), worst)))))
         on = np.flatnonzero(stood).tolist()
-        some = [logs[case][1] for case in on]
+        some = [logs[case].log for case in on]
         grounded = list(self.pool.map(_ground, repeat(campaign), repeat(weights), on, some))
         usable = [
             (grounding, found)
@@ -292,8 +291,7 @@ def walk_all(
 ) -> Sequence[ScoredLog]:
     """Walk a set in all cases, and keep each walk in the folder as it ends."""
     robot, paths = campaign.robot, log_paths(campaign, number)
-    empty = log_of(no_samples(len(robot.joint_lower), len(robot.foot_point)))
-    like = LogScore(0.0, 0.0), empty
+    like = ScoredLog(0.0, log_of(no_samples(len(robot.joint_lower), len(robot.foot_point))))
     missing = [case for case, path in enumerate(paths) if not path.exists()]
     running = {pool.submit(walk_case, campaign, weights, case): case for case in missing}
     for job in as_completed(running):

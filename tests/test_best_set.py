@@ -12,7 +12,7 @@ from hector_jax.control.weights import nominal
 from hector_jax.core.inputs import InputError
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.loss import alphas
-from hector_jax.verdict import choice
+from hector_jax.walk_tuning import best_set
 
 
 def masses(plants):
@@ -37,19 +37,19 @@ def masses(plants):
 def test_a_budget_of_walks_is_of_three_sets_on_eight_plants_or_of_eight_on_more(
     given, commands, plants, walks
 ):
-    found, budget = choice.walk_plants(ROBOT, *given, commands)
+    found, budget = best_set.walk_plants(ROBOT, *given, commands)
     assert (len(found), budget) == (plants, walks)
     if given[0] == 0:
         same = jax.tree.map(np.array_equal, found, [hfs(ROBOT.description)])
         assert jax.tree.all(same)
     else:  # a larger budget begins with the same plants
-        assert masses(found) == masses(choice.drawn_plants(ROBOT, 16)[:plants])
+        assert masses(found) == masses(best_set.drawn_plants(ROBOT, 16)[:plants])
         assert len(set(masses(found))) == plants
 
 
 def test_plants_of_a_tuning_are_none_that_judge_it():
     standin = masses(arguments.plants("standin", range(32), ROBOT.description))
-    assert not {*standin} & {*masses(choice.drawn_plants(ROBOT, 1000))}
+    assert not {*standin} & {*masses(best_set.drawn_plants(ROBOT, 1000))}
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_plants_of_a_tuning_are_none_that_judge_it():
 )
 def test_a_budget_with_which_no_second_set_walks_is_one_line(given, commands, words):
     with pytest.raises(InputError) as error:
-        choice.walk_plants(ROBOT, *given, commands)
+        best_set.walk_plants(ROBOT, *given, commands)
     assert str(error.value) == f"--walks must be 0 or {words}"
 
 
@@ -74,7 +74,7 @@ def test_a_budget_that_is_too_small_is_told_before_there_is_a_run():
 
 def test_best_is_tuned_with_numbers_of_its_own_and_smoothly_where_asked():
     start = nominal()._replace(others={"footstep_width": np.array(0.09)})
-    config, at = choice.settings_of_best(CONFIG, ROBOT, start, smooth=3.0, safe=0.05)
+    config, at = best_set.settings_of_best(CONFIG, ROBOT, start, smooth=3.0, safe=0.05)
     assert at.others == {**BEST_OTHERS, "position_limit": 0.05, "footstep_width": 0.09}
     before = alphas(CONFIG.loss)
     assert alphas(config.loss) == {**before, "L_between": 3.0 * before["L_ctrl"]}
