@@ -15,7 +15,7 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.weights import direction_names, expert
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
-from hector_jax.tuning.curvature import determined
+from hector_jax.tuning.curvature import determined, least_squares_jit
 from hector_jax.tuning.difftune import (
     TuneConfig,
     init,
@@ -25,6 +25,7 @@ from hector_jax.tuning.difftune import (
     tune_step,
     update,
 )
+from hector_jax.tuning.evaluate import evaluate_jit
 from hector_jax.tuning.loss import PAPER_LOSS, losses, residuals, total
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 
@@ -108,6 +109,17 @@ def test_the_matrix_is_the_curvature_of_the_loss_along_the_change_of_the_residua
     # the entries of weights that matter little too
     size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     np.testing.assert_allclose(matrix / size, expected / size, atol=1e-5)
+
+
+def test_loss_and_gradient_come_with_the_matrix():
+    scenario, at = Scenario(ROBOT, named_command("s"), ANCHOR, PLAIN), init(CONFIG, START).start
+    found, matrix = least_squares_jit(CONFIG.rollout, scenario, at, PAPER_LOSS, others=OTHERS)
+    expected = evaluate_jit(CONFIG.rollout, scenario, at, PAPER_LOSS)
+    assert float(found.loss) == pytest.approx(float(expected.loss), rel=1e-12)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-9), found.terms, expected.terms)
+    slopes = [gradient_by_steps(at, each.gradient, OTHERS) for each in (found, expected)]
+    np.testing.assert_allclose(*slopes, rtol=1e-7, atol=1e-7 * abs(slopes[1]).max())
+    assert matrix.shape == (22, 22)
 
 
 def speed(step):

@@ -39,18 +39,14 @@ DOWN = np.r_[0.5 * np.ones(12) / np.sqrt(12.0), np.zeros(12)]  # half an e-fold,
 LENGTH = {"slope": 100.0}  # [e-folds] from nominal, where the slope ends
 
 
-def ground(campaign, weights, case, log):
+def slope_of(campaign, weights, case, log):
     """A slope that is the same up to some distance from the start, and then none."""
     vector = np.asarray(weights_to_vector(weights))
     goes_on = np.linalg.norm(np.log(vector / NOMINAL)) < LENGTH["slope"]
     slope = vector_to_weights(-DOWN / vector * goes_on)
     gradient = jax.tree.map(np.asarray, slope._replace(others={n: 0.0 for n in weights.others}))
     terms = {term.name: np.ones(()) for term in campaign.config.loss}
-    return None, Evaluation(np.ones(()), terms, gradient, np.zeros(()), np.zeros(()))
-
-
-def matrix(config, grounding, weights, walk):
-    return np.eye(18)
+    return Evaluation(np.ones(()), terms, gradient, np.zeros(()), np.zeros(())), np.eye(18)
 
 
 @pytest.fixture
@@ -58,8 +54,7 @@ def folder(monkeypatch, tmp_path):
     """A folder for reports of three trajectories, in which nothing is computed for a proposal."""
     pool = HandsOver()
     monkeypatch.setattr(propose, "workers", lambda *_: nullcontext(pool))
-    monkeypatch.setattr(walks, "_ground", ground)
-    monkeypatch.setattr(walks, "matrix_job", matrix)
+    monkeypatch.setattr(walks, "_slope", slope_of)
     monkeypatch.setattr(propose.arguments, "beyond", lambda *_: "")  # takes a quarter of a second
     monkeypatch.setattr(propose.arguments, "limits", lambda *_: None)
     monkeypatch.chdir(tmp_path)
@@ -349,7 +344,7 @@ def loss_of_ahead(folder, error):
     """L of a walk with this error [m]."""
     one, path = campaign(folder), Path(plain("ahead", "scored.npz", error=error))
     log = walk_log.read_log(path, ROBOT, SECONDS, one.config.rollout.walk.gait.tick)
-    return walk_log.evaluate_log(one.config, ROBOT, one.commands["ahead"], log)[0].loss
+    return walk_log.evaluate_log(one.config, ROBOT, one.commands["ahead"], log).loss
 
 
 @pytest.fixture

@@ -174,20 +174,17 @@ def toy_loss(weights, case):
     return (case + 1) * 1e6 * (0.01 + off @ off)
 
 
-def toy_ground(campaign, weights, case, log):
-    """The slope of the loss of a case; stands for that of the model grounded on its walk."""
+def toy_slope(campaign, weights, case, log):
+    """Slope and matrix of the loss of a case, in the place of those grounded on its walk."""
     gradient = 2e6 * (case + 1) * away(weights, case) / np.asarray(weights_to_vector(weights))
     loss, zero = np.asarray(toy_loss(weights, case)), np.zeros(())
     terms = {term.name: loss for term in campaign.config.loss}
-    return case, Evaluation(loss, terms, as_weights(gradient), zero, zero)
+    matrix = 2e6 * (case + 1) * np.asarray(directions() @ directions().T)
+    return Evaluation(loss, terms, as_weights(gradient), zero, zero), matrix
 
 
 def as_weights(vector):
     return jax.tree.map(np.asarray, vector_to_weights(vector))
-
-
-def toy_matrix(config, case, weights, walk):
-    return 2e6 * (case + 1) * np.asarray(directions() @ directions().T)
 
 
 def toy_case(campaign, weights, case):
@@ -221,8 +218,7 @@ class Here(Executor):
 @pytest.fixture
 def toy(monkeypatch, robot, tmp_path):
     """A function that makes a campaign whose walks and slopes are those of the toy."""
-    monkeypatch.setattr(walks, "_ground", toy_ground)
-    monkeypatch.setattr(walks, "matrix_job", toy_matrix)
+    monkeypatch.setattr(walks, "_slope", toy_slope)
     monkeypatch.setattr(walks, "walk_case", toy_case)
     WALKED.clear()
 
@@ -355,9 +351,7 @@ def test_a_fall_is_a_bounded_loss_of_its_case_and_has_no_slope(toy):
     found, worst = objective.evaluate(at), np.e * start[2]
     value = np.exp(np.mean(np.log([start[0], worst, worst])))
     assert float(found.loss) == pytest.approx(value)
-    slopes = [
-        np.asarray(weights_to_vector(toy_ground(one, at, c, LOG)[1].gradient)) for c in (0, 2)
-    ]
+    slopes = [np.asarray(weights_to_vector(toy_slope(one, at, c, LOG)[0].gradient)) for c in (0, 2)]
     expected = value / 3.0 * sum(g / start[c] for g, c in zip(slopes, (0, 2), strict=True))
     np.testing.assert_allclose(weights_to_vector(found.gradient), expected, rtol=1e-12)
     assert float(found.fallen) == 0.0

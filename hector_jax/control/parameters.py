@@ -254,3 +254,16 @@ def gradient_by_steps(
     """Return the gradient by the steps of `stepped` from that by the weights."""
     none = jnp.zeros_like(steps_between(weights, weights, others))
     return jax.vjp(lambda steps: stepped(weights, steps, others), none)[1](gradient)[0]
+
+
+def gradient_by_weights(
+    weights: Weights, gradient: Float[Array, " n"], others: Sequence[str] = ()
+) -> Weights:
+    """Return the gradient by the weights, all feet alike, of one by steps: `gradient_by_steps`."""
+    none = jnp.zeros_like(gradient)
+
+    def change(steps: Float[Array, " n"]) -> Weights:
+        return jax.jvp(lambda steps: stepped(weights, steps, others), (none,), (steps,))[1]
+
+    squares = gradient_by_steps(weights, change(jnp.ones_like(gradient)), others)
+    return change(gradient / squares)

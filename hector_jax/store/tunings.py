@@ -40,7 +40,6 @@ from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning, step_statu
 from hector_jax.tuning.evaluate import (
     Evaluation,
     Objective,
-    Walk,
     evaluate_jit,
     gradient_norms,
     mean_objective,
@@ -94,19 +93,18 @@ def rollouts_of(config: TuneConfig, robot: Robot, problem: Problem) -> list[Scen
     return scenarios
 
 
-def evaluation_job(
-    config: TuneConfig, scenario: Any, weights: Weights, walk: Walk = rollout
-) -> Evaluation:
+def _evaluation_job(config: TuneConfig, scenario: Scenario, weights: Weights) -> Evaluation:
     """Evaluate weights, see `evaluate`; a job of a worker process."""
-    return jax.device_get(evaluate_jit(config.rollout, scenario, weights, config.loss, walk=walk))
+    inputs = config.rollout, scenario, weights, config.loss
+    return jax.device_get(evaluate_jit(*inputs, walk=rollout))
 
 
-def matrix_job(
-    config: TuneConfig, scenario: Any, weights: Weights, walk: Walk = rollout
+def _matrix_job(
+    config: TuneConfig, scenario: Scenario, weights: Weights
 ) -> Float[np.ndarray, "n n"]:
     """Compute the matrix of weights, see `gauss_newton`; a job of a worker process."""
-    inputs = {"walk": walk, "others": config.others}
-    return np.asarray(gauss_newton_jit(config.rollout, scenario, weights, config.loss, **inputs))
+    inputs = config.rollout, scenario, weights, config.loss
+    return np.asarray(gauss_newton_jit(*inputs, walk=rollout, others=config.others))
 
 
 def _usable(
@@ -149,10 +147,10 @@ def _objective(setup: Setup, start: Weights, problem: Problem) -> Objective:
 
     scenarios, losses = rollouts_of(config, robot, problem), np.ones(1)
     if len(scenarios) > 1:
-        found = of_all(evaluation_job, scenarios, start)
+        found = of_all(_evaluation_job, scenarios, start)
         scenarios, losses = _usable(config, problem, scenarios, found)
-    evaluations = partial(of_all, evaluation_job, scenarios)
-    return mean_objective(evaluations, partial(of_all, matrix_job, scenarios), losses)
+    evaluations = partial(of_all, _evaluation_job, scenarios)
+    return mean_objective(evaluations, partial(of_all, _matrix_job, scenarios), losses)
 
 
 def _tune_on_cpu(
@@ -169,7 +167,7 @@ def _tune_on_gpu(setup: Setup, start: Weights, problem: Problem) -> Tuning:
     models, losses = rollouts_of(config, robot, problem), np.ones(1)
     if len(models) > 1:
         at = difftune.init(config, start).start
-        found = [evaluation_job(config, model, at) for model in models]
+        found = [_evaluation_job(config, model, at) for model in models]
         models, losses = _usable(config, problem, models, found)
     effects = [model.effect for model in (models if problem.draws else models[:1])]
     scenarios = [
@@ -337,7 +335,7 @@ def _first_evaluation(config: TuneConfig, robot: Robot, start: Weights, problem:
 def _first_matrix(config: TuneConfig, robot: Robot, start: Weights, problem: Problem) -> None:
     """Compute the matrix of the start in one rollout, so that its first need not compile."""
     scenario, *_ = rollouts_of(config, robot, problem)
-    matrix_job(config, scenario, difftune.init(config, start).start)
+    _matrix_job(config, scenario, difftune.init(config, start).start)
 
 
 def compile_programs(

@@ -13,11 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.control.parameters import stepped, steps_between
+from hector_jax.control.parameters import gradient_by_weights, stepped, steps_between
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
-from hector_jax.tuning.evaluate import Walk
-from hector_jax.tuning.loss import Loss, residuals
+from hector_jax.core.trajectory import Trajectory
+from hector_jax.tuning.evaluate import Evaluation, Walk
+from hector_jax.tuning.loss import Loss, losses, residuals
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
 _NAMED = 0.35  # a direction is named by the weights of at least this share of its largest entry
@@ -55,7 +56,7 @@ class Determined(NamedTuple):
         return [name for name, share in self.weights.items() if share < 0.5]
 
 
-def gauss_newton(
+def least_squares(
     config: RolloutConfig,
     scenario: Any,
     weights: Weights,
@@ -63,32 +64,48 @@ def gauss_newton(
     *,
     walk: Walk = rollout,
     others: tuple[str, ...] = (),
-) -> Float[Array, "n n"]:
-    """Compute the Gauss-Newton matrix of the loss of a rollout, in forward mode.
+) -> tuple[Evaluation, Float[Array, "n n"]]:
+    """Compute the loss, its gradient and its Gauss-Newton matrix in one program, in forward mode.
 
-    It is 2 J'J, where J is the derivative of the residuals.
+    With the residuals r and their derivative J these are r'r, 2 J'r and 2 J'J.
 
     Args:
         config, scenario, walk: of the rollout, see `evaluate`.
-        weights: the point of evaluation.
+        weights: the point of evaluation; all feet share one R.
         loss: terms and their weights.
         others: names of numbers beside Q and R.
 
     Returns:
-        The matrix in the n coordinates of `parameters.stepped`.
+        The evaluation, and the matrix in the n coordinates of `parameters.stepped`.
     """
     zero = jnp.zeros(len(steps_between(weights, weights, others)))
 
-    def rows(steps: Float[Array, " n"]) -> Float[Array, " rows"]:
-        return residuals(loss, walk(config, scenario, stepped(weights, steps, others)))
+    def rows(steps: Float[Array, " n"]) -> tuple[Float[Array, " rows"], Trajectory]:
+        trajectory = walk(config, scenario, stepped(weights, steps, others))
+        return residuals(loss, trajectory), trajectory
 
-    along = jax.vmap(lambda direction: jax.jvp(rows, (zero,), (direction,))[1])
-    J = along(jnp.eye(len(zero)))
-    return 2.0 * J @ J.T
+    def along(direction: Float[Array, " n"]) -> tuple:
+        return jax.jvp(rows, (zero,), (direction,), has_aux=True)
+
+    r, J, trajectory = jax.vmap(along, out_axes=(None, 0, None))(jnp.eye(len(zero)))
+    gradient = gradient_by_weights(weights, 2.0 * J @ r, others)
+    checks = jnp.mean(1.0 * trajectory.fallen), jnp.max(trajectory.residual)
+    found = Evaluation(r @ r, losses(loss, trajectory), gradient, *checks)
+    return found, 2.0 * J @ J.T
 
 
-gauss_newton_jit = jax.jit(gauss_newton, static_argnums=0, static_argnames=("walk", "others"))
-"""`gauss_newton`, compiled once per rollout and set of terms."""
+def gauss_newton(
+    config: RolloutConfig, scenario: Any, weights: Weights, loss: Loss, **options: Any
+) -> Float[Array, "n n"]:
+    """Return the matrix of `least_squares`."""
+    return least_squares(config, scenario, weights, loss, **options)[1]
+
+
+least_squares_jit, gauss_newton_jit = (
+    jax.jit(function, static_argnums=0, static_argnames=("walk", "others"))
+    for function in (least_squares, gauss_newton)
+)
+"""`least_squares` and `gauss_newton`, compiled once per rollout and set of terms."""
 
 
 def determined(

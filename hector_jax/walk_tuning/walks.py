@@ -38,11 +38,11 @@ from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
 from hector_jax.grfm import network
 from hector_jax.sim.loop import Job
 from hector_jax.store.cache import content_key, robot_hash
-from hector_jax.store.tunings import evaluation_job, matrix_job
 from hector_jax.tuning import difftune
+from hector_jax.tuning.curvature import least_squares_jit
 from hector_jax.tuning.difftune import Iteration, TuneState, step_status
 from hector_jax.tuning.evaluate import Evaluation, Objective
-from hector_jax.tuning.grounded import Grounding, fit_grounding, grounded_rollout
+from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
 from hector_jax.tuning.rollout import Scenario
 from hector_jax.tuning.status import StepStatus
 from hector_jax.walk_tuning.campaign import Campaign, walker_hash
@@ -128,13 +128,17 @@ def walk_case(campaign: Campaign, weights: Weights, case: int) -> ScoredLog:
     return evaluate_log(config, robot, command, log)
 
 
-def _ground(campaign: Campaign, weights: Weights, case: int, log: Log) -> tuple[Grounding, Any]:
-    """Ground the plain rigid body on a walk; return it and its evaluation."""
+def _slope(
+    campaign: Campaign, weights: Weights, case: int, log: Log
+) -> tuple[Evaluation, Float[np.ndarray, "n n"]]:
+    """Return loss, gradient and matrix of the plain rigid body grounded on a walk."""
     config, robot = campaign.config, campaign.robot
     effect = network.effect_of(None, config.rollout.walk)
     scenario = Scenario(robot, campaign.cases[case][1], standing_anchor(robot), effect)
     grounding = fit_grounding(config.rollout, scenario, weights, trajectory_of(log))
-    return jax.device_get(grounding), evaluation_job(config, grounding, weights, grounded_rollout)
+    inputs = config.rollout, grounding, weights, config.loss
+    options = {"walk": grounded_rollout, "others": config.others}
+    return jax.device_get(least_squares_jit(*inputs, **options))
 
 
 # The objective
@@ -146,7 +150,7 @@ class _Walks:
     def __init__(self, pool: Executor, campaign: Campaign, ask: Ask) -> None:
         self.pool, self.campaign, self.ask = pool, campaign, ask
         self.losses: list[np.ndarray] = []
-        self.slopes: list[tuple[float, Grounding]] = []  # of the set that walked last
+        self.last: Any = None  # matrix of the set that walked last
 
     def place(self, state: TuneState) -> TuneState:
         """Return the state at the set that has walked, should the code place it elsewhere."""
@@ -176,36 +180,22 @@ class _Walks:
         value = float(np.exp(np.mean(np.log(np.where(stood, np.minimum(losses, worst), worst)))))
         on = np.flatnonzero(stood).tolist()
         some = [logs[case].log for case in on]
-        grounded = list(self.pool.map(_ground, repeat(campaign), repeat(weights), on, some))
-        usable = [
-            (grounding, found)
-            for grounding, found in grounded
-            if step_status(campaign.config, found) == StepStatus.ACCEPTED
-        ]
+        slopes = self.pool.map(_slope, repeat(campaign), repeat(weights), on, some)
+        usable = [x for x in slopes if step_status(campaign.config, x[0]) == StepStatus.ACCEPTED]
         if not usable:
             nothing = jax.tree.map(np.zeros_like, weights)
             terms = {term.name: np.zeros(()) for term in campaign.config.loss}
             return Evaluation(np.asarray(value), terms, nothing, np.ones(()), np.zeros(()))
-        shares = [value / len(losses) / float(found.loss) for _, found in usable]
-        self.slopes = [(x, grounding) for x, (grounding, _) in zip(shares, usable, strict=True)]
+        shares = [value / len(losses) / float(found.loss) for found, _ in usable]
 
         def mean(trees: Sequence[Any]) -> Any:
-            scaled = (
-                jax.tree.map(lambda x, k=k: k * x, t) for k, t in zip(shares, trees, strict=True)
-            )
-            return jax.tree.map(lambda *x: np.sum(x, axis=0), *scaled)
+            return jax.tree.map(lambda *x: np.tensordot(shares, x, axes=1), *trees)
 
-        terms, gradient = (
-            mean([getattr(e, name) for _, e in usable]) for name in ("terms", "gradient")
-        )
-        residual = np.max([found.residual for _, found in usable])
+        found, matrices = zip(*usable, strict=True)
+        self.last = mean(matrices)
+        terms, gradient = mean([(e.terms, e.gradient) for e in found])
+        residual = np.max([e.residual for e in found])
         return Evaluation(np.asarray(value), terms, gradient, np.zeros(()), residual)
-
-    def matrix(self, weights: Weights) -> Float[np.ndarray, "n n"]:
-        """Return the mean of the matrices on the walks of `evaluate`."""
-        job = partial(matrix_job, self.campaign.config, weights=weights, walk=grounded_rollout)
-        shares, groundings = zip(*self.slopes, strict=True)
-        return np.tensordot(shares, list(self.pool.map(job, groundings)), axes=1)
 
 
 def tune_on_walks(
@@ -246,7 +236,7 @@ def tune_on_walks(
 
         report_progress(0, config.iterations + 1, "compiling")
         try:
-            parts = objective.evaluate, objective.matrix, objective.place
+            parts = objective.evaluate, lambda _: objective.last, objective.place
             tuning = difftune.descend(config, campaign.start, Objective(*parts), on_iteration)
         except Waiting:
             write_record()  # without sets whose report was undone
