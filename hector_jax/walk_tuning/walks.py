@@ -104,14 +104,10 @@ Ask = Callable[[int, Weights], Sequence[ScoredLog]]
 
 def changes(sets: Sequence[WalkedSet]) -> list[float | None]:
     """Return the mean change of log L against the start [%], over the cases in which both stood."""
-    start = sets[0]
-    both = [~(start.fell | x.fell) for x in sets]
-    return [
-        100.0 * float(np.expm1(np.mean(np.log(x.losses[on] / start.losses[on]))))
-        if on.any()
-        else None
-        for x, on in zip(sets, both, strict=True)
-    ]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs = [np.log(x.losses / sets[0].losses) for x in sets]
+    both = [x[np.isfinite(x)] for x in logs]
+    return [100.0 * float(np.expm1(x.mean())) if x.size else None for x in both]
 
 
 # Jobs of worker processes
@@ -182,20 +178,18 @@ class _Walks:
         some = [logs[case].log for case in on]
         slopes = self.pool.map(_slope, repeat(campaign), repeat(weights), on, some)
         usable = [x for x in slopes if step_status(campaign.config, x[0]) == StepStatus.ACCEPTED]
-        if not usable:
-            nothing = jax.tree.map(np.zeros_like, weights)
-            terms = {term.name: np.zeros(()) for term in campaign.config.loss}
-            return Evaluation(np.asarray(value), terms, nothing, np.ones(()), np.zeros(()))
         shares = [value / len(losses) / float(found.loss) for found, _ in usable]
 
         def mean(trees: Sequence[Any]) -> Any:
             return jax.tree.map(lambda *x: np.tensordot(shares, x, axes=1), *trees)
 
-        found, matrices = zip(*usable, strict=True)
-        self.last = mean(matrices)
-        terms, gradient = mean([(e.terms, e.gradient) for e in found])
-        residual = np.max([e.residual for e in found])
-        return Evaluation(np.asarray(value), terms, gradient, np.zeros(()), residual)
+        gradient, residual = jax.tree.map(np.zeros_like, weights), 0.0
+        if usable:
+            found, matrices = zip(*usable, strict=True)
+            gradient, self.last = mean([e.gradient for e in found]), mean(matrices)
+            residual = np.max([e.residual for e in found])
+        fallen = np.asarray(float(not usable))
+        return Evaluation(np.asarray(value), {}, gradient, fallen, np.asarray(residual))
 
 
 def tune_on_walks(
