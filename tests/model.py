@@ -52,7 +52,5 @@ def small_effect(seed=0):
 def mean_of(objectives, losses=None):
     """The mean of objectives, see `mean_objective`."""
     return mean_objective(
-        lambda weights: [objective.evaluate(weights) for objective in objectives],
-        lambda weights: [objective.matrix(weights) for objective in objectives],
-        losses,
+        lambda weights: [objective.slope(weights) for objective in objectives], losses
     )

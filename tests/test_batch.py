@@ -74,13 +74,17 @@ def toy_matrix(config, scenario, weights, loss, *, walk=None, others=()):
     return 3.0 * loss[0].weight * (2.0 * shared @ shared.T + along)
 
 
+def toy_slope(config, scenario, weights, loss, *, walk, others):
+    seen = difftune.evaluate_jit(config, scenario, weights, loss)
+    return seen, toy_matrix(config, scenario, weights, loss, others=others)
+
+
 @pytest.fixture
 def on_toy(monkeypatch):
     monkeypatch.setattr(batch, "evaluate", toy)
     monkeypatch.setattr(batch, "gauss_newton", toy_matrix)
     monkeypatch.setattr(difftune, "evaluate_jit", jax.jit(toy, static_argnums=0))
-    jitted = jax.jit(toy_matrix, static_argnums=0, static_argnames="others")
-    monkeypatch.setattr(difftune, "gauss_newton_jit", jitted)
+    monkeypatch.setattr(difftune, "least_squares_jit", toy_slope)
 
 
 def scenario(name="straight", loss=PAPER_LOSS, scale=1.0, effect=0, variation=None):
@@ -142,13 +146,11 @@ def test_the_mean_of_scenarios_is_tuned_by_the_mean_of_their_matrices(on_toy):
     found = tune_batch(config, ROBOT, asked, last_command)
 
     def divided(name, loss, k):
-        objective = difftune.model_objective(replace(config, loss=loss), alone_on(name))
+        def slope(weights):
+            seen, matrix = difftune.model_slope(replace(config, loss=loss), alone_on(name), weights)
+            return Evaluation(*jax.tree.map(lambda x: x / k, seen[:3]), *seen[3:]), matrix / k
 
-        def evaluate(weights):
-            seen = objective.evaluate(weights)
-            return Evaluation(*jax.tree.map(lambda x: x / k, seen[:3]), *seen[3:])
-
-        return Objective(evaluate, lambda weights: objective.matrix(weights) / k)
+        return Objective(slope)
 
     alone = difftune.descend(config, STARTS[2], mean_of([divided(*case) for case in cases]))
     ours = jax.tree.map(lambda x: x[0], found)

@@ -19,13 +19,13 @@ from hector_jax.tuning.curvature import determined, least_squares_jit
 from hector_jax.tuning.difftune import (
     TuneConfig,
     init,
-    model_objective,
+    model_slope,
     trial_weights,
     tune,
     tune_step,
     update,
 )
-from hector_jax.tuning.evaluate import evaluate_jit
+from hector_jax.tuning.evaluate import Objective, evaluate_jit
 from hector_jax.tuning.loss import PAPER_LOSS, losses, residuals, total
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 
@@ -53,7 +53,7 @@ def _rolled(command, z, direction):
 
 
 OBJECTIVES = [
-    model_objective(CONFIG, Scenario(ROBOT, named_command(name), ANCHOR, PLAIN))
+    Objective(partial(model_slope, CONFIG, Scenario(ROBOT, named_command(name), ANCHOR, PLAIN)))
     for name in COMMANDS
 ]
 
@@ -62,7 +62,7 @@ def point(objective):
     """Gradient and matrix that a tuning has at Z."""
     state = init(CONFIG, START)._replace(steps=jnp.asarray(Z))
     at = trial_weights(CONFIG, state)
-    after, _ = update(CONFIG, state, objective.evaluate(at), objective.matrix(at))
+    after, _ = update(CONFIG, state, *objective.slope(at))
     return after.rule
 
 

@@ -112,12 +112,13 @@ OPTIMUM = vector(nominal()) * np.exp(
 def quadratic(fixed=0.0, falls=lambda weights: False):
     """1e6 |log(theta / optimum)|^2."""
 
-    def evaluate(weights):
+    def slope(weights):
         away = np.log(vector(weights) / OPTIMUM)
         gradient = vector_to_weights(jnp.asarray(2e6 * away / vector(weights)))
-        return evaluation(fixed + 1e6 * away @ away, gradient, float(falls(weights)))
+        found = evaluation(fixed + 1e6 * away @ away, gradient, float(falls(weights)))
+        return found, 2e6 * directions() @ directions().T
 
-    return Objective(evaluate, lambda weights: 2e6 * directions() @ directions().T)
+    return Objective(slope)
 
 
 def tune_toy(toy, config=TuneConfig(ridge=0.0), start=None, **more):  # noqa: B008
@@ -170,12 +171,12 @@ def test_a_short_step_that_gains_little_is_no_convergence():
     """The radius has collapsed after misses, though a step of one e-fold would gain."""
     toy, calls = quadratic(), []
 
-    def evaluate(weights):
+    def slope(weights):
         calls.append(1)
-        found = toy.evaluate(weights)
-        return found._replace(loss=10.0 * found.loss) if len(calls) in (2, 3) else found
+        found, matrix = toy.slope(weights)
+        return found._replace(loss=found.loss * (10.0 if len(calls) in (2, 3) else 1.0)), matrix
 
-    found = tune_toy(toy._replace(evaluate=evaluate), TuneConfig(ridge=0.0, iterations=30))
+    found = tune_toy(toy._replace(slope=slope), TuneConfig(ridge=0.0, iterations=30))
     assert [i.accepted for i in found.iterations[:4]] == [True, False, False, True]
     assert float(found.loss) < 1e-3 * float(found.iterations[0].evaluation.loss)
 
@@ -205,8 +206,9 @@ def test_after_a_fall_a_shorter_step_leaves_from_the_last_accepted_weights():
 
 
 def test_a_step_that_gains_less_than_a_hundredth_of_the_prediction_is_refused():
-    level = quadratic()._replace(evaluate=lambda weights: evaluation(1.0, random_tree(1)))
-    level = level._replace(matrix=lambda weights: jnp.eye(18))
+    level = quadratic()._replace(
+        slope=lambda weights: (evaluation(1.0, random_tree(1)), jnp.eye(18))
+    )
     found = tune_toy(level)
     assert [i.accepted for i in found.iterations] == [True, False, False, False]
     assert found.iterations[-1].reason == "the loss did not fall as predicted"

@@ -125,14 +125,17 @@ def test_a_fault_is_refused_and_shrunk_and_the_run_goes_on(fault, rule):
     assert [float(row.step_size) for row in rows[:2]] == [0.0, 1.0]
     assert [row.accepted for row in rows[:2]] == [True, False]
     first = next(i for i, row in enumerate(rows[1:], 1) if row.accepted)
-    assert {row.reason for row in rows[1:first]} == {REASONS[fault]}
+    reason = REASONS[fault]
+    if (fault, rule) == (Fault.STATE, "gauss_newton"):  # its derivatives end where the robot fell
+        reason = REASONS[Fault.FALL]
+    assert {row.reason for row in rows[1:first]} == {reason}
     for before, row in zip(rows[1:], rows[2:], strict=False):
         if not before.accepted:
             assert float(row.step_size) == pytest.approx(before.step_size / RULES[rule])
         elif rule == "relative":
             assert row.step_size == min(1.0, 2.0 * before.step_size)
     reasons = {row.reason for row in rows if not row.accepted}
-    assert reasons <= {REASONS[fault], "the loss did not fall as predicted"}
+    assert reasons <= {reason, "the loss did not fall as predicted"}
     assert all(inside(row.weights) for row in rows)
     assert all(furthest(row.weights) <= reach for row in rows if row.accepted)
     assert 0.0 < furthest(found.weights) <= reach
@@ -178,20 +181,17 @@ def test_no_number_makes_weights_that_are_not_finite(number, rule, where, begin)
         odd = {where: number} if looks["all"] >= begin else {}
         gradient = jax.tree.map(lambda w: np.full_like(w, odd.get("gradient", 1e-3)), nominal())
         loss = np.asarray(float(odd.get("loss", 1.0 / looks["all"])))
-        return Evaluation(loss, {}, gradient, np.asarray(0.0), np.asarray(1e-12))
-
-    def matrix(weights):
-        odd = where == "matrix" and looks["all"] >= begin
-        return np.full((18, 18), number) if odd else np.eye(18)
+        matrix = np.full((18, 18), number) if "matrix" in odd else np.eye(18)
+        return Evaluation(loss, {}, gradient, np.asarray(0.0), np.asarray(1e-12)), matrix
 
     config, refused = replace(CONFIG, rule=rule), not abs(number) < 1e150
     if where == "matrix":
         refused = rule == "gauss_newton" and not np.isfinite(number)
     if refused and begin == 1:
         with pytest.raises(InputError, match="loss or gradient not finite"):
-            descend(config, nominal(), Objective(look, matrix))
+            descend(config, nominal(), Objective(look))
         return
-    found = descend(config, nominal(), Objective(look, matrix))
+    found = descend(config, nominal(), Objective(look))
     assert all(inside(iteration.weights) for iteration in found.iterations)
     assert inside(found.weights)
     if refused:

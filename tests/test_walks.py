@@ -344,11 +344,11 @@ def test_a_fall_is_a_bounded_loss_of_its_case_and_has_no_slope(toy):
     objective = walks._Walks(
         Here(), one, partial(asked, cases=3, fell=lambda n, case, _: (n, case) == (1, 1))
     )
-    assert float(objective.evaluate(at).loss) == pytest.approx(np.exp(np.log(start).mean()))
+    assert float(objective.slope(at)[0].loss) == pytest.approx(np.exp(np.log(start).mean()))
     objective.ask = lambda number, weights: [
         walk_log.ScoredLog(x, LOG) for x in (start[0], np.inf, 1e3 * start[2])
     ]
-    found, worst = objective.evaluate(at), np.e * start[2]
+    (found, _), worst = objective.slope(at), np.e * start[2]
     value = np.exp(np.mean(np.log([start[0], worst, worst])))
     assert float(found.loss) == pytest.approx(value)
     slopes = [np.asarray(weights_to_vector(toy_slope(one, at, c, LOG)[0].gradient)) for c in (0, 2)]

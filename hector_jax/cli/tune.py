@@ -47,7 +47,7 @@ from hector_jax.tuning.evaluate import aligned
 from hector_jax.verdict import judging, metrics
 from hector_jax.verdict.judging import ScoredWalks
 from hector_jax.walk_tuning import best_set
-from hector_jax.walk_tuning.walks import Campaign, WalkTuning, tune_on_walks
+from hector_jax.walk_tuning.walks import Campaign, WalkTuning, first_slope, tune_on_walks
 
 _ARTEFACTS = "kept"  # folder in it
 
@@ -152,7 +152,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
             run.start,
             first,
             others=[(*run.settings_of_best, tunings.Problem((first.command,), None, 1))],
-            meanwhile=partial(_check_start, run),
+            meanwhile=partial(_meanwhile, run),
         ):
             say(f"before any tuning, {first.name} on hfs: {line}")
         data = arguments.data_folder(args.data, args.robot, robot)
@@ -209,6 +209,14 @@ def _print(
             show_elsewhere()
 
     print_result(run.args.json, {"run": str(run.folder), "traj": run.name, **result}, print_text)
+
+
+def _meanwhile(run: _Run) -> None:
+    """Do what needs none of the programs of the tunings on the model."""
+    _check_start(run)
+    campaign, budget = _campaign(run, run.settings_of_best[1])
+    if budget:
+        run.setup.pool.submit(first_slope, campaign)
 
 
 def _check_start(run: _Run) -> None:

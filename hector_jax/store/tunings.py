@@ -7,6 +7,7 @@ the rollouts of a tuning, and several tunings, run in parallel.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from itertools import repeat
 from pathlib import Path
@@ -35,17 +36,15 @@ from hector_jax.store.cache import content_key, load_or_make
 from hector_jax.store.folder import as_row
 from hector_jax.store.setup import Setup
 from hector_jax.tuning import batch, difftune
-from hector_jax.tuning.curvature import gauss_newton_jit
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning, step_status
 from hector_jax.tuning.evaluate import (
     Evaluation,
     Objective,
-    evaluate_jit,
     gradient_norms,
     mean_objective,
 )
-from hector_jax.tuning.loss import loss_of_robot
-from hector_jax.tuning.rollout import Scenario, rollout, rollout_config
+from hector_jax.tuning.loss import Loss, loss_of_robot
+from hector_jax.tuning.rollout import Scenario, rollout_config
 from hector_jax.tuning.status import StepStatus
 from hector_jax.tuning.variation import drawn_variation
 
@@ -93,20 +92,6 @@ def rollouts_of(config: TuneConfig, robot: Robot, problem: Problem) -> list[Scen
     return scenarios
 
 
-def _evaluation_job(config: TuneConfig, scenario: Scenario, weights: Weights) -> Evaluation:
-    """Evaluate weights, see `evaluate`; a job of a worker process."""
-    inputs = config.rollout, scenario, weights, config.loss
-    return jax.device_get(evaluate_jit(*inputs, walk=rollout))
-
-
-def _matrix_job(
-    config: TuneConfig, scenario: Scenario, weights: Weights
-) -> Float[np.ndarray, "n n"]:
-    """Compute the matrix of weights, see `gauss_newton`; a job of a worker process."""
-    inputs = config.rollout, scenario, weights, config.loss
-    return np.asarray(gauss_newton_jit(*inputs, walk=rollout, others=config.others))
-
-
 def _usable(
     config: TuneConfig,
     problem: Problem,
@@ -135,22 +120,19 @@ def _usable(
 def _objective(setup: Setup, start: Weights, problem: Problem) -> Objective:
     """Return the mean over the rollouts of a problem, each divided by its share at the start.
 
-    All rollouts of an evaluation, or their matrices, are computed at the same time.
+    All rollouts of an evaluation are computed at the same time.
     """
     pool, config, robot = setup
 
-    def of_all(
-        job: Callable[..., Any], scenarios: Sequence[Scenario], weights: Weights
-    ) -> list[Any]:
+    def of_all(scenarios: Sequence[Scenario], weights: Weights) -> list[tuple[Evaluation, Any]]:
         host = jax.tree.map(np.asarray, weights)
-        return list(pool.map(job, repeat(config), scenarios, repeat(host)))
+        return list(pool.map(difftune.model_slope, repeat(config), scenarios, repeat(host)))
 
     scenarios, losses = rollouts_of(config, robot, problem), np.ones(1)
     if len(scenarios) > 1:
-        found = of_all(_evaluation_job, scenarios, start)
+        found = [evaluation for evaluation, _ in of_all(scenarios, start)]
         scenarios, losses = _usable(config, problem, scenarios, found)
-    evaluations = partial(of_all, _evaluation_job, scenarios)
-    return mean_objective(evaluations, partial(of_all, _matrix_job, scenarios), losses)
+    return mean_objective(partial(of_all, scenarios), losses)
 
 
 def _tune_on_cpu(
@@ -167,7 +149,7 @@ def _tune_on_gpu(setup: Setup, start: Weights, problem: Problem) -> Tuning:
     models, losses = rollouts_of(config, robot, problem), np.ones(1)
     if len(models) > 1:
         at = difftune.init(config, start).start
-        found = [_evaluation_job(config, model, at) for model in models]
+        found = [difftune.model_slope(config, model, at)[0] for model in models]
         models, losses = _usable(config, problem, models, found)
     effects = [model.effect for model in (models if problem.draws else models[:1])]
     scenarios = [
@@ -285,8 +267,13 @@ def tune_all(
 
 
 def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:
+    weights = difftune.init(config, nominal(robot)).start
+
+    def evaluate(scenario: Scenario, loss: Loss) -> Evaluation:
+        return difftune.model_slope(replace(config, loss=loss), scenario, weights)[0]
+
     results = [
-        gradient_norms(config.rollout, scenario, nominal(robot), config.loss)
+        gradient_norms(partial(evaluate, scenario), weights, config.loss)
         for scenario in rollouts_of(config, robot, problem)
     ]
     return jax.tree.map(lambda *x: float(np.mean(x)), *results)
@@ -323,21 +310,6 @@ def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
     return [stack([i.weights for i in history if i.accepted]) for history in histories]
 
 
-def _first_evaluation(config: TuneConfig, robot: Robot, start: Weights, problem: Problem) -> None:
-    """Evaluate the start of a tuning in one rollout, so that its first call need not compile."""
-    scenario, *_ = rollouts_of(config, robot, problem)
-    inputs = config.rollout, scenario, difftune.init(config, start).start, config.loss
-    evaluation = jax.device_get(evaluate_jit(*inputs, walk=rollout))
-    if not problem.draws:
-        difftune.check_start(StepStatus(int(step_status(config, evaluation))), evaluation)
-
-
-def _first_matrix(config: TuneConfig, robot: Robot, start: Weights, problem: Problem) -> None:
-    """Compute the matrix of the start in one rollout, so that its first need not compile."""
-    scenario, *_ = rollouts_of(config, robot, problem)
-    _matrix_job(config, scenario, difftune.init(config, start).start)
-
-
 def compile_programs(
     setup: Setup,
     start: Weights,
@@ -365,14 +337,18 @@ def compile_programs(
     walking = pool.submit(
         not_the_weights, config.rollout.walk, jax.tree.map(np.asarray, robot), job
     )
-    preparing, plain = [], (config, start, Problem((trajectory.command,), None))
+    plain = config, start, Problem((trajectory.command,), None)
+    preparing = []
     for settings, weights, problem in (plain, *others):
-        for first in (_first_evaluation, _first_matrix):
-            preparing.append(pool.submit(first, settings, robot, weights, problem))
+        scenario, *_ = rollouts_of(settings, robot, problem)
+        at = jax.tree.map(np.asarray, difftune.init(settings, weights).start)
+        preparing.append(pool.submit(difftune.model_slope, settings, scenario, at))
     meanwhile()
     with bar("compiling, once on a machine") as report_progress:
         report_progress(0, len(preparing), "")
         for done, job in enumerate(preparing, 1):
             job.result()
             report_progress(done, len(preparing), "")
+    evaluation, _ = preparing[0].result()
+    difftune.check_start(StepStatus(int(step_status(config, evaluation))), evaluation)
     return walking.result()

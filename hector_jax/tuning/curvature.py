@@ -80,18 +80,16 @@ def least_squares(
     """
     zero = jnp.zeros(len(steps_between(weights, weights, others)))
 
-    def rows(steps: Float[Array, " n"]) -> tuple[Float[Array, " rows"], Trajectory]:
+    def rows(steps: Float[Array, " n"]) -> tuple[Float[Array, " rows"], tuple[Array, Trajectory]]:
         trajectory = walk(config, scenario, stepped(weights, steps, others))
-        return residuals(loss, trajectory), trajectory
+        r = residuals(loss, trajectory)
+        return r, (r, trajectory)
 
-    def along(direction: Float[Array, " n"]) -> tuple:
-        return jax.jvp(rows, (zero,), (direction,), has_aux=True)
-
-    r, J, trajectory = jax.vmap(along, out_axes=(None, 0, None))(jnp.eye(len(zero)))
-    gradient = gradient_by_weights(weights, 2.0 * J @ r, others)
+    J, (r, trajectory) = jax.jacfwd(rows, has_aux=True)(zero)
+    gradient = gradient_by_weights(weights, 2.0 * r @ J, others)
     checks = jnp.mean(1.0 * trajectory.fallen), jnp.max(trajectory.residual)
     found = Evaluation(r @ r, losses(loss, trajectory), gradient, *checks)
-    return found, 2.0 * J @ J.T
+    return found, 2.0 * J.T @ J
 
 
 def gauss_newton(
@@ -101,11 +99,9 @@ def gauss_newton(
     return least_squares(config, scenario, weights, loss, **options)[1]
 
 
-least_squares_jit, gauss_newton_jit = (
-    jax.jit(function, static_argnums=0, static_argnames=("walk", "others"))
-    for function in (least_squares, gauss_newton)
-)
-"""`least_squares` and `gauss_newton`, compiled once per rollout and set of terms."""
+least_squares_jit = jax.jit(least_squares, static_argnums=0, static_argnames=("walk", "others"))
+"""`least_squares`, compiled once per rollout and set of terms: new weights, commands, nets and
+alphas need no compilation."""
 
 
 def determined(

@@ -34,10 +34,10 @@ from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, check
 from hector_jax.core.trajectory import Wrench
 from hector_jax.core.tree import stack, where
 from hector_jax.tuning import step_rules
-from hector_jax.tuning.curvature import gauss_newton_jit
+from hector_jax.tuning.curvature import least_squares_jit
 from hector_jax.tuning.evaluate import Evaluation, Objective, evaluate_jit
 from hector_jax.tuning.loss import PAPER_LOSS, alphas, check_loss
-from hector_jax.tuning.rollout import RolloutConfig, Scenario
+from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.tuning.status import StepStatus, Stop, status_text
 from hector_jax.tuning.step_rules import StepState
 
@@ -165,6 +165,20 @@ class Tuning(NamedTuple):
 def tune_step(config: TuneConfig, scenario: Scenario, weights: Weights) -> Evaluation:
     """Evaluate weights with the rollout and the loss of a tuning, compiled."""
     return evaluate_jit(config.rollout, scenario, weights, config.loss)
+
+
+def model_slope(
+    config: TuneConfig, scenario: Scenario, weights: Weights
+) -> tuple[Evaluation, Float[Array, "n n"] | None]:
+    """Return what a tuning on the model steps by, compiled; see `evaluate.Objective`.
+
+    By the default rule it is one program: all derivatives of a rollout in forward mode take twice
+    as long as its gradient in reverse mode, and no longer than the matrix alone.
+    """
+    if config.rule != "gauss_newton":
+        return tune_step(config, scenario, weights), None
+    inputs = config.rollout, scenario, weights, config.loss
+    return least_squares_jit(*inputs, walk=rollout, others=config.others)
 
 
 def step_rule(config: TuneConfig, start: Weights) -> optax.GradientTransformationExtraArgs:
@@ -301,13 +315,8 @@ def tune(
 
     Source: problem P.
     """
-    return descend(config, weights, model_objective(config, scenario), on_iteration)
-
-
-def model_objective(config: TuneConfig, scenario: Scenario) -> Objective:
-    """Return the objective of a tuning on the model, see `rollout`."""
-    matrix = partial(gauss_newton_jit, config.rollout, scenario, loss=config.loss)
-    return Objective(partial(tune_step, config, scenario), partial(matrix, others=config.others))
+    objective = Objective(partial(model_slope, config, scenario))
+    return descend(config, weights, objective, on_iteration)
 
 
 def descend(
@@ -321,7 +330,7 @@ def descend(
     Args:
         config: the settings.
         weights: the start.
-        objective: its matrix is taken where an iteration is accepted, by the default rule.
+        objective: its slope is taken at each trial.
         on_iteration: called after each iteration.
 
     Raises:
@@ -335,9 +344,8 @@ def descend(
         state = objective.place(state)
         # copies, because a view would keep the device's array for as long as the history
         trial = jax.tree.map(np.array, trial_weights(config, state))
-        evaluation, matrix = jax.tree.map(np.array, objective.evaluate(trial)), state.rule.matrix
-        if _needs_matrix(static, state, evaluation):
-            matrix = objective.matrix(trial)
+        evaluation, matrix = jax.tree.map(np.array, objective.slope(trial))
+        matrix = matrix if config.rule == "gauss_newton" else state.rule.matrix
         state, iteration = _update(static, state, evaluation, matrix)
         history.append(jax.tree.map(np.array, iteration))
         on_iteration(history[-1])
@@ -372,6 +380,3 @@ def needs_matrix(config: TuneConfig, state: TuneState, evaluation: Evaluation) -
     if config.rule != "gauss_newton":
         return False
     return trial_status(config, state, evaluation) == StepStatus.ACCEPTED
-
-
-_needs_matrix = jax.jit(needs_matrix, static_argnums=0)

@@ -13,7 +13,7 @@ from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError, unknown
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.tuning.loss import Loss, Terms, losses, total, with_alphas
-from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
+from hector_jax.tuning.rollout import RolloutConfig, rollout
 
 Walk = Callable[[RolloutConfig, Any, Weights], Trajectory]
 """`rollout`, or another walk on the model by its settings, what it walks, and weights."""
@@ -66,20 +66,20 @@ need no compilation."""
 
 
 class Objective(NamedTuple):
-    """Functions of a weight set that a tuning minimises by."""
+    """What a tuning minimises."""
 
-    evaluate: Callable[[Weights], Evaluation]
-    matrix: Callable[[Weights], Any]  # Gauss-Newton matrix (n, n) in the steps of the tuning
+    # the evaluation of a weight set, and its Gauss-Newton matrix (n, n) in the steps of the tuning;
+    # None for a rule that uses none
+    slope: Callable[[Weights], tuple[Evaluation, Any]]
     # takes the state of a tuning to the point that is evaluated, if that is given
     place: Callable[[Any], Any] = lambda state: state
 
 
 def mean_objective(
-    evaluations: Callable[[Weights], Sequence[Evaluation]],
-    matrices: Callable[[Weights], Sequence[Any]],
+    slopes: Callable[[Weights], Sequence[tuple[Evaluation, Any]]],
     losses: Float[np.ndarray, " n"] | None = None,
 ) -> Objective:
-    """Return the mean of several objectives, given by all their evaluations and matrices.
+    """Return the mean of several objectives, given by all their slopes.
 
     Each is divided by its share of the losses, those at the start, so that all have equal
     influence; without losses all count as they are. `fallen` and `residual` are the worst.
@@ -90,25 +90,28 @@ def mean_objective(
         scaled = [jax.tree.map(lambda x, k=k: x / k, t) for t, k in zip(trees, scales, strict=True)]
         return jax.tree.map(lambda *values: np.mean(values, axis=0), *scaled)
 
-    def evaluate(weights: Weights) -> Evaluation:
-        found = jax.device_get(evaluations(weights))
-        return mean(found)._replace(
-            fallen=np.max([e.fallen for e in found]),
-            residual=np.max([e.residual for e in found]),
-        )
+    def slope(weights: Weights) -> tuple[Evaluation, Any]:
+        found = jax.device_get(slopes(weights))
+        evaluation, matrix = mean(found)
+        worst = {n: np.max([getattr(e, n) for e, _ in found]) for n in ("fallen", "residual")}
+        return evaluation._replace(**worst), matrix
 
-    return Objective(evaluate, lambda weights: mean(list(map(np.asarray, matrices(weights)))))
+    return Objective(slope)
 
 
 def gradient_norms(
-    config: RolloutConfig, scenario: Scenario, weights: Weights, loss: Loss
+    evaluate: Callable[[Loss], Evaluation], weights: Weights, loss: Loss
 ) -> dict[str, float]:
-    """Return the norm of each term's gradient in log-weights, without its alpha."""
+    """Return the norm of each term's gradient in log-weights, without its alpha.
+
+    Args:
+        evaluate: evaluates the weights by a loss.
+        weights, loss: whose gradients are meant.
+    """
 
     def norm(name: str) -> float:
         single = tuple(term._replace(weight=float(term.name == name)) for term in loss)
-        evaluation = evaluate_jit(config, scenario, weights, single, walk=rollout)
-        logs = jax.tree.map(jnp.multiply, evaluation.gradient, weights)
+        logs = jax.tree.map(jnp.multiply, evaluate(single).gradient, weights)
         return float(jnp.linalg.norm(weights_to_vector(logs)))
 
     return {term.name: norm(term.name) for term in loss}

@@ -137,6 +137,12 @@ def _slope(
     return jax.device_get(least_squares_jit(*inputs, **options))
 
 
+def first_slope(campaign: Campaign) -> None:
+    """Walk the start in the first case, so that the programs of the others are in the cache."""
+    start = difftune.init(campaign.config, campaign.start).start
+    _slope(campaign, start, 0, walk_case(campaign, start, 0).log)
+
+
 # The objective
 
 
@@ -146,7 +152,6 @@ class _Walks:
     def __init__(self, pool: Executor, campaign: Campaign, ask: Ask) -> None:
         self.pool, self.campaign, self.ask = pool, campaign, ask
         self.losses: list[np.ndarray] = []
-        self.last: Any = None  # matrix of the set that walked last
 
     def place(self, state: TuneState) -> TuneState:
         """Return the state at the set that has walked, should the code place it elsewhere."""
@@ -164,7 +169,7 @@ class _Walks:
         steps = parameters.steps_between(state.start, there, config.others)
         return state._replace(steps=jnp.asarray(steps))
 
-    def evaluate(self, weights: Weights) -> Evaluation:
+    def slope(self, weights: Weights) -> tuple[Evaluation, Float[np.ndarray, "n n"]]:
         """Walk a set; value and slope of the mean of log L."""
         campaign, number = self.campaign, len(self.losses)
         logs = self.ask(number, weights)
@@ -183,13 +188,14 @@ class _Walks:
         def mean(trees: Sequence[Any]) -> Any:
             return jax.tree.map(lambda *x: np.tensordot(shares, x, axes=1), *trees)
 
-        gradient, residual = jax.tree.map(np.zeros_like, weights), 0.0
+        numbers = len(parameters.step_names(weights, campaign.config.others))
+        gradient, matrix = jax.tree.map(np.zeros_like, weights), np.zeros((numbers, numbers))
+        residual, fallen = 0.0, float(not usable)
         if usable:
-            found, matrices = zip(*usable, strict=True)
-            gradient, self.last = mean([e.gradient for e in found]), mean(matrices)
-            residual = np.max([e.residual for e in found])
-        fallen = np.asarray(float(not usable))
-        return Evaluation(np.asarray(value), {}, gradient, fallen, np.asarray(residual))
+            gradient, matrix = mean([(found.gradient, matrix) for found, matrix in usable])
+            residual = np.max([found.residual for found, _ in usable])
+        checks = np.asarray(fallen), np.asarray(residual)
+        return Evaluation(np.asarray(value), {}, gradient, *checks), matrix
 
 
 def tune_on_walks(
@@ -230,8 +236,8 @@ def tune_on_walks(
 
         report_progress(0, config.iterations + 1, "compiling")
         try:
-            parts = objective.evaluate, lambda _: objective.last, objective.place
-            tuning = difftune.descend(config, campaign.start, Objective(*parts), on_iteration)
+            parts = Objective(objective.slope, objective.place)
+            tuning = difftune.descend(config, campaign.start, parts, on_iteration)
         except Waiting:
             write_record()  # without sets whose report was undone
             waiting = load_weights(weights_path(campaign.folder, len(sets)), campaign.robot)
