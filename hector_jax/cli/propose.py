@@ -21,7 +21,7 @@ from hector_jax.core.runtime import workers
 from hector_jax.robot.model import load_robot
 from hector_jax.store import tunings
 from hector_jax.store.folder import CONFIG
-from hector_jax.walk_tuning import reported_walks, walk_log, walks
+from hector_jax.walk_tuning import best_set, reported_walks, walk_log, walks
 from hector_jax.walk_tuning.campaign import Campaign
 
 
@@ -168,7 +168,7 @@ def _campaign(args: Propose) -> Campaign:
     """
     robot = jax.tree.map(np.asarray, load_robot(args.robot))
     trajectories = arguments.load_trajectories(args.traj, robot)
-    config = tunings.tune_config(robot, others=tunables(args.tune))
+    config = best_set.on_walks(tunings.tune_config(robot, others=tunables(args.tune)))
     config = arguments.with_length(config, trajectories[0])
     begun = (args.folder / CONFIG).exists()  # from weights that --start may no longer name
     start = str(walks.weights_path(args.folder, 0)) if begun else args.start

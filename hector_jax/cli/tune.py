@@ -292,8 +292,8 @@ def _campaign(run: _Run, start: Weights) -> tuple[Campaign, int]:
     """Return the tuning of `best` on walks, from the result of that on the model; its budget."""
     robot, args, (config, _) = run.setup.robot, run.args, run.settings_of_best
     plants, budget = best_set.walk_plants(robot, args.walk_plants, args.walks, len(run.commands))
-    config = replace(config, least_gain=best_set.WALK_GAIN)
-    inputs = run.folder / "walks", config, robot, start, run.commands, plants
+    settings = best_set.on_walks(config)
+    inputs = run.folder / "walks", settings, robot, start, run.commands, plants
     return Campaign(*inputs, arguments.engine_of(args)), budget
 
 

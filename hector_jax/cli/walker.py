@@ -1,7 +1,6 @@
 """A controller of the user: what the logs of its walks show, its twin, a tuning on its walks."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -116,7 +115,7 @@ def tune_walker(folder: Path, args: Tune) -> None:
     commands = {trajectory.name: trajectory.command for trajectory in trajectories}
     campaign = Campaign(
         folder / "walks",
-        replace(config, least_gain=best_set.WALK_GAIN),
+        best_set.on_walks(config),
         robot,
         arguments.weights_by_name(args.start, robot),
         commands,

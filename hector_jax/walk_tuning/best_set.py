@@ -21,12 +21,10 @@ LIMIT, WIDTH, FEEDBACK = 0.19, 7 / 8, 2 / 3
 """Numbers of `best` beside its weights: limit of the position error as a share of the height of the
 centre of mass, unless one is given; width and velocity feedback of the steps as shares of the
 controller's. With them fewer walks fall under pushes and on slippery floors."""
-PLANTS, SETS = 8, 3
+PLANTS, SETS = 12, 4
 """Drawn plants on which `best` walks, and weight sets that walk there: the result on the model and
-two steps."""
+three steps."""
 MANY_SETS, MOST_PLANTS = 8, 16  # of a larger budget of walks, unless plants are given
-WALK_GAIN = 1e-3
-"""Least gain of a tuning on walks: they are the robot's own, so that a small gain is one."""
 _FIRST_SEED = 7000  # of the plants on which `best` walks
 
 
@@ -64,20 +62,29 @@ def walk_plants(
     return plants, walks
 
 
+def on_walks(config: TuneConfig) -> TuneConfig:
+    """Return settings for a tuning on walks, which are the robot's own.
+
+    So a small gain is one, and the steps may go further than the model is to be trusted.
+    """
+    return replace(config, ridge=config.ridge / 3.0, least_gain=config.least_gain / 5.0)
+
+
 def settings_of_best(
     config: TuneConfig, robot: Robot, start: Weights, *, smooth: float, safe: float | None
 ) -> tuple[TuneConfig, Weights]:
     """Return settings and start of the tuning of `best` from those of `without` and `with`.
 
-    It tunes the gains of the integral action too.
+    It tunes the gains of the integral action too, and how far ahead steps turn.
 
     Args:
         config, robot, start: of those tunings.
         smooth: price of changes of the command between switches of stance, see `loss.smoother`.
         safe: limit of the position error [m]; None: the controller's, else `LIMIT`.
     """
-    others = tuple(dict.fromkeys((*config.others, *GROUPS["integral"])))
     walk = config.rollout.walk
+    lead = ("turn_lead",) * (walk.footstep.rule != "paper")
+    others = tuple(dict.fromkeys((*config.others, *GROUPS["integral"], *lead)))
     limit = safe or walk.mpc.position_limit or round(LIMIT * float(robot.standing_height), 3)
     numbers = {
         "position_limit": limit,
