@@ -240,6 +240,29 @@ def test_a_toy_is_tuned_to_the_optimum_of_the_mean_of_log_l(toy):
     assert found.rows[0] == {"change": 0.0, "falls": 0, "accepted": True}
 
 
+def test_a_tuning_begins_with_the_start_that_walks_best_and_repeats_none_of_its_walks(toy):
+    aim = np.asarray(directions().T) @ np.linspace(-0.4, 0.2, 18)
+    near, far = (as_weights(np.exp(x * aim) * NOMINAL) for x in (0.9, -2.0))
+    starts = {"far": far, "near": near, "nominal": nominal()}
+    first = walks.from_best_of(Here(), toy(cases=5), starts)
+    assert same(first.start, walks.difftune.init(CONFIG, near).start)
+    assert [case for case, _ in WALKED] == 3 * [0, 1, 2]
+    found = walks.tune_on_walks(Here(), first, walks=10)
+    assert [case for case, _ in WALKED[9:]] == [3, 4, 0, 1, 2, 3, 4]
+    assert same(found.sets[0].weights, first.start)
+    again = walks.from_best_of(Here(), toy(cases=5), starts)
+    assert same(again.start, first.start)
+    assert len(WALKED) == 16
+
+
+def test_of_several_starts_one_that_falls_less_often_is_taken(monkeypatch, toy):
+    losses = iter([np.inf, 1e6, 1e6, 2e6, 2e6, 1.5e6])
+    monkeypatch.setattr(walks, "walk_case", lambda *_: walk_log.ScoredLog(next(losses), LOG))
+    starts = {"falls": expert(), "stands": nominal()}
+    first = walks.from_best_of(Here(), toy(), starts)
+    assert same(first.start, walks.difftune.init(CONFIG, nominal()).start)
+
+
 @pytest.mark.parametrize("killed_at", [0, 1, 4, 5])
 def test_a_run_that_is_killed_keeps_each_walk_and_ends_as_one_that_is_not(
     monkeypatch, toy, killed_at

@@ -194,8 +194,8 @@ class Tune(Configured, ByWalker, Parallel):
     resume: Annotated[Path | None, PathKind.RUN] = None  # interrupted run folder to continue
     video: bool = True  # make a film of the nominal and the best weights
     verdict: bool = False  # print up to 12 walks more: in other engines, or with other masses
-    # walks to spend on row `best` after its tuning on the model; 0 for none; by default three sets
-    # walk on eight drawn plants (docs/howto/walks.md)
+    # walks to spend on row `best` after the choice of its start; 0 for none; by default four sets
+    # walk on twelve drawn plants (docs/howto/walks.md)
     walks: Annotated[int | None, Range(0, 100_000)] = None
     # drawn plants of these walks, 0 for the simulator; by default so that eight sets can walk
     walk_plants: Annotated[int | None, Range(0, 1000)] = None

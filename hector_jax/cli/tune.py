@@ -47,7 +47,13 @@ from hector_jax.tuning.evaluate import aligned
 from hector_jax.verdict import judging, metrics
 from hector_jax.verdict.judging import ScoredWalks
 from hector_jax.walk_tuning import best_set
-from hector_jax.walk_tuning.walks import Campaign, WalkTuning, first_slope, tune_on_walks
+from hector_jax.walk_tuning.walks import (
+    Campaign,
+    WalkTuning,
+    first_slope,
+    from_best_of,
+    tune_on_walks,
+)
 
 _ARTEFACTS = "kept"  # folder in it
 
@@ -272,11 +278,15 @@ def _tune_sets(run: _Run, net: nets.TrainedNet) -> _Tuned:
         **{name: tuning.weights for name, tuning in done.items()},
     }
     _save_sets(run, sets)  # a tuning on walks may be long: what there is can be used meanwhile
-    campaign, budget = _campaign(run, sets["best"])
-    walks = tune_on_walks(setup.pool, campaign, walks=budget) if budget else None
-    if walks and not walks.sets[0].accepted:
-        say(f"`best` stays as the model has it: {walks.reason}")
-    elif walks:
+    campaign, budget = _campaign(run, start)
+    walks = None
+    if budget:
+        tuned = {name: sets[name] for name in ("best", "with", "without")}
+        starts = {n: w._replace(others={**start.others, **w.others}) for n, w in tuned.items()}
+        campaign = from_best_of(setup.pool, campaign, starts | {"start": start})
+        walks = tune_on_walks(setup.pool, campaign, walks=budget)
+        if not walks.sets[0].accepted:
+            say(f"`best` is the set that was to be tuned on walks: {walks.reason}")
         sets["best"] = walks.sets[walks.best].weights
         _save_sets(run, sets)
     return _Tuned(net, done, sets, walks)

@@ -12,7 +12,7 @@ uses is in a folder, so that it begins anew in each call and no walk is made twi
 - `logs/3-0.npz`: its log in case 0, at the plan interval, or the file that was reported.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import replace
 from functools import partial
@@ -31,6 +31,7 @@ from hector_jax.control.weights import Weights
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.console import bar
 from hector_jax.core.environment import code_hash
+from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.journal import continue_journal, write_rows
 from hector_jax.core.trajectory import no_samples
@@ -55,6 +56,7 @@ from hector_jax.walk_tuning.walk_log import (
 )
 
 RECORD = "walks.jsonl"
+CHOICE_PLANTS = 3  # on which several starts walk
 _FALL = 1.0  # log L of a fall above the largest of the start
 
 
@@ -141,6 +143,33 @@ def first_slope(campaign: Campaign) -> None:
     """Walk the start in the first case, so that the programs of the others are in the cache."""
     start = difftune.init(campaign.config, campaign.start).start
     _slope(campaign, start, 0, walk_case(campaign, start, 0).log)
+
+
+def from_best_of(pool: Executor, campaign: Campaign, starts: Mapping[str, Weights]) -> Campaign:
+    """Return the campaign from that of several starts which walks best.
+
+    Each walks on the first plants; of those that fall least often it is that with the least mean of
+    log L. Its walks are not made again.
+
+    Args:
+        pool, campaign: as for `tune_on_walks`; its own start does not matter.
+        starts: weights by name.
+    """
+    tried, rows = [], []
+    for name, start in starts.items():
+        inputs = {"start": start, "plants": campaign.plants[:CHOICE_PLANTS]}
+        one = replace(campaign, folder=campaign.folder / "starts" / name, **inputs)
+        continue_journal(one.folder / RECORD, _head(one), "walks of a start", dict, _remedy(one))
+        save_weights(weights_path(one.folder, 0), one.start)
+        rows.append([walked.loss for walked in walk_all(pool, one, 0, one.start)])
+        tried.append(one)
+    losses = np.array(rows)
+    stood = np.isfinite(losses)
+    means = np.log(losses, where=stood, out=np.zeros_like(losses)).sum(axis=1)
+    best = tried[np.lexsort((means, -stood.sum(axis=1)))[0]]
+    for path, kept in zip(log_paths(best, 0), log_paths(campaign, 0), strict=False):
+        write_file(kept, path.read_bytes())
+    return replace(campaign, start=best.start)
 
 
 # The objective
