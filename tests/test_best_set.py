@@ -22,10 +22,10 @@ def masses(plants):
 @pytest.mark.parametrize(
     ("given", "commands", "plants", "walks"),
     [
-        ((None, None), 1, 8, 24),  # three sets
-        ((None, None), 3, 8, 72),
-        ((2, None), 1, 2, 6),
-        ((0, None), 1, 1, 3),  # the hfs
+        ((None, None), 1, 12, 48),  # four sets
+        ((None, None), 3, 12, 144),
+        ((2, None), 1, 2, 8),
+        ((0, None), 1, 1, 4),  # the hfs
         ((None, 0), 1, 1, 0),
         ((None, 2), 1, 1, 2),
         ((None, 40), 1, 5, 40),  # eight sets
@@ -34,7 +34,7 @@ def masses(plants):
         ((3, 24), 2, 3, 24),
     ],
 )
-def test_a_budget_of_walks_is_of_three_sets_on_eight_plants_or_of_eight_on_more(
+def test_a_budget_of_walks_is_of_four_sets_on_twelve_plants_or_of_eight_on_more(
     given, commands, plants, walks
 ):
     found, budget = best_set.walk_plants(ROBOT, *given, commands)
@@ -78,7 +78,7 @@ def test_best_is_tuned_with_numbers_of_its_own_and_smoothly_where_asked():
     assert at.others == {**BEST_OTHERS, "position_limit": 0.05, "footstep_width": 0.09}
     before = alphas(CONFIG.loss)
     assert alphas(config.loss) == {**before, "L_between": 3.0 * before["L_ctrl"]}
-    assert config.others == GROUPS["integral"]
+    assert config.others == (*GROUPS["integral"], "turn_lead")
     assert config.rollout == CONFIG.rollout
     jax.tree.map(np.testing.assert_array_equal, at[:2], start[:2])
 

@@ -11,6 +11,7 @@ import pytest
 from model import BEST_OTHERS, small_net
 from pretend import call, instead, refused
 from synthetic import synthetic_walk
+from test_walks import HandsOver
 
 from hector_jax.cli import arguments, doctor
 from hector_jax.cli.flags import COMMANDS, Tune
@@ -132,7 +133,7 @@ def test_walks_of_other_settings_are_refused_before_anything_is_compiled(monkeyp
     monkeypatch.setattr(nets, "compile_programs", None)
     write_json(tmp_path / "card.json", {"walks": 4, "settings": {"walks": 4}})
     with pytest.raises(InputError, match=f"^{tmp_path}: made"):
-        nets.collect_walks(None, nets.CollectConfig(walks=5), load_robot(), tmp_path)
+        nets.collect_walks(HandsOver(), nets.CollectConfig(walks=5), load_robot(), tmp_path)
 
 
 def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):

@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -103,9 +104,9 @@ def test_no_joint_gets_more_than_its_limit_through_the_linkage_either():
         build_world(plant, HECTOR.description).model.actuator_ctrlrange[:, 1], limit
     )
     for sign in (1.0, -1.0):
-        _, torque = step_actuators(HECTOR, plant, init_actuators(10), sign * 1e3 * np.ones(10))
+        _, torque = step_actuators(HECTOR, plant, init_actuators(10), sign * 1e3 * jnp.ones(10))
         np.testing.assert_allclose(torque, sign * limit)
-    _, torque = step_actuators(HECTOR, plant, init_actuators(10), np.ones(10))
+    _, torque = step_actuators(HECTOR, plant, init_actuators(10), jnp.ones(10))
     assert torque[3] == pytest.approx(1.5)  # the knee, and half of the ankle
 
 

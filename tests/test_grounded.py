@@ -1,6 +1,7 @@
 """Rollouts grounded on a measured walk: the walk itself, and its slope."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from model import AHEAD, ANCHOR, BRIEF, PLAIN, ROBOT
@@ -50,7 +51,7 @@ def measured():
 
 def from_yaw(walk, yaw):
     """The same walk of a robot that begins with another heading [rad]."""
-    R = np.asarray(rot_z(yaw))
+    R = np.asarray(rot_z(jnp.asarray(yaw)))
 
     def turned(state):
         vectors = (x @ R.T for x in (state.position, state.ang_velocity, state.velocity))

@@ -151,8 +151,10 @@ def test_the_reference_of_a_log_is_that_of_its_walk(robot):
 
 
 def test_numbers_of_the_legs_are_not_tuned(robot):
+    flags = Tune()
+    object.__setattr__(flags, "tune", ("foot_height",))  # which the command line does not offer
     with pytest.raises(InputError, match="foot_height cannot be tuned by gradients"):
-        run_folder.trajectories(Tune(tune=("foot_height",)), robot)
+        run_folder.trajectories(flags, robot)
 
 
 # On a toy

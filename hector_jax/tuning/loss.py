@@ -96,18 +96,18 @@ def position_error(trajectory: Trajectory) -> Float[Array, "T 3"]:
     return _tracking(trajectory, error, minimum)
 
 
-def command_changes(trajectory: Trajectory) -> Float[Array, "T-1 feet 6"]:
+def command_changes(trajectory: Trajectory) -> Float[Array, "changes feet 6"]:
     """Return the changes of the commanded wrench [N and N m]; none after a fall."""
     changes = jnp.diff(jnp.concatenate(trajectory.command, axis=-1), axis=0)
     return jnp.where(trajectory.fallen[1:, None, None], 0.0, changes)
 
 
-def _switched(trajectory: Trajectory) -> Bool[Array, "T-1 1 1"]:
+def _switched(trajectory: Trajectory) -> Bool[Array, "changes 1 1"]:
     contact = trajectory.contact
     return jnp.any(contact[1:] != contact[:-1], axis=-1)[:, None, None]
 
 
-def changes_between(trajectory: Trajectory) -> Float[Array, "T-1 feet 6"]:
+def changes_between(trajectory: Trajectory) -> Float[Array, "changes feet 6"]:
     """Return the changes of the command between switches of stance."""
     return jnp.where(_switched(trajectory), 0.0, command_changes(trajectory))
 

@@ -114,7 +114,7 @@ def boxed_step(ridge: float, state: StepState, box: Box, size: Any = None) -> Fl
 
 
 def _trusted_step(
-    slope: Float[Array, " n"], curvature: Float[Array, "n n"], size: Float[Array, ""]
+    slope: Float[Array, " n"], curvature: Float[Array, "n n"], size: Float[Array, ""] | float
 ) -> Float[Array, " n"]:
     """Return the step that minimises a quadratic model within a ball."""
     values, vectors = jnp.linalg.eigh(curvature)
