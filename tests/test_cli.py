@@ -188,7 +188,7 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     assert [*dict.fromkeys(line["set"] for line in lines)] == ["without", "with", "best"]
     best = load_weights(run / "weights" / "best.json")
     assert best.others == {**best.others, **BEST_OTHERS}
-    assert best.others.keys() == {*BEST_OTHERS, *GROUPS["integral"]}
+    assert best.others.keys() == {*BEST_OTHERS, *GROUPS["integral"], "turn_lead"}
     start, *steps = result["walks"]
     assert start == {"change": 0.0, "falls": 0, "accepted": True}
     assert 1 <= len(steps) <= 2  # of the three sets of the budget
