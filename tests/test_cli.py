@@ -191,7 +191,7 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     assert best.others.keys() == {*BEST_OTHERS, *GROUPS["integral"], "turn_lead"}
     start, *steps = result["walks"]
     assert start == {"change": 0.0, "falls": 0, "accepted": True}
-    assert 1 <= len(steps) <= 2  # of the three sets of the budget
+    assert 1 <= len(steps) <= 3  # of the four sets of the budget
     assert len(list((run / "walks" / "logs").glob("*.npz"))) == 1 + len(steps)
     report = (run / "report.md").read_text()
     for words in ("hardware stand-in", "## Tuning on walks", "Each weight set walked 1 time "):
