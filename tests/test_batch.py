@@ -75,14 +75,14 @@ def toy_matrix(config, scenario, weights, loss, *, walk=None, others=()):
 
 
 def toy_slope(config, scenario, weights, loss, *, walk, others):
-    seen = difftune.evaluate_jit(config, scenario, weights, loss)
+    seen = toy(config, scenario, weights, loss)
     return seen, toy_matrix(config, scenario, weights, loss, others=others)
 
 
 @pytest.fixture
 def on_toy(monkeypatch):
     monkeypatch.setattr(batch, "evaluate", toy)
-    monkeypatch.setattr(batch, "gauss_newton", toy_matrix)
+    monkeypatch.setattr(batch, "least_squares", toy_slope)
     monkeypatch.setattr(difftune, "evaluate_jit", jax.jit(toy, static_argnums=0))
     monkeypatch.setattr(difftune, "least_squares_jit", toy_slope)
 
@@ -175,7 +175,7 @@ from hector_jax.core.runtime import setup_jax
 setup_jax()
 all_devices()
 import test_batch as t
-t.batch.evaluate, t.batch.gauss_newton = t.toy, t.toy_matrix
+t.batch.evaluate, t.batch.least_squares = t.toy, t.toy_slope
 # an odd number of problems: one device has one more to do
 asked = t.stack([t.problem(w, [t.scenario("s")]) for w in t.STARTS[:3]])
 tuned = partial(t.tune_batch, t.TOY, t.ROBOT, asked, t.last_command)

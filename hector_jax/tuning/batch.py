@@ -30,7 +30,7 @@ from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.robot.model import Robot
 from hector_jax.tuning import difftune
-from hector_jax.tuning.curvature import gauss_newton
+from hector_jax.tuning.curvature import least_squares
 from hector_jax.tuning.difftune import Iteration, TuneConfig, TuneState, Tuning
 from hector_jax.tuning.evaluate import Evaluation, Walk, evaluate
 from hector_jax.tuning.loss import PAPER_LOSS, Loss
@@ -143,10 +143,8 @@ def _evaluate(
         return found._replace(loss=value, terms=terms, gradient=gradient)
 
     def curvature(scenario: Scenario, loss: Loss, scale: Array) -> Array:
-        matrix = gauss_newton(
-            config.rollout, scenario, weights, loss, walk=walk, others=config.others
-        )
-        return matrix / scale
+        inputs = config.rollout, scenario, weights, loss
+        return least_squares(*inputs, walk=walk, others=config.others)[1] / scale
 
     stacked = over_scenarios(value)
     weighted_sum = partial(jnp.tensordot, tail_weights(stacked.loss, problem.tail), axes=1)

@@ -92,13 +92,6 @@ def least_squares(
     return found, 2.0 * J.T @ J
 
 
-def gauss_newton(
-    config: RolloutConfig, scenario: Any, weights: Weights, loss: Loss, **options: Any
-) -> Float[Array, "n n"]:
-    """Return the matrix of `least_squares`."""
-    return least_squares(config, scenario, weights, loss, **options)[1]
-
-
 least_squares_jit = jax.jit(least_squares, static_argnums=0, static_argnames=("walk", "others"))
 """`least_squares`, compiled once per rollout and set of terms: new weights, commands, nets and
 alphas need no compilation."""
