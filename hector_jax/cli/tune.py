@@ -277,7 +277,8 @@ def _tune_sets(run: _Run, net: nets.TrainedNet) -> _Tuned:
         **({} if run.args.start in BASELINES else {"start": run.start}),
         **{name: tuning.weights for name, tuning in done.items()},
     }
-    _save_sets(run, sets)  # a tuning on walks may be long: what there is can be used meanwhile
+    for name, weights in sets.items():  # a tuning on walks may be long: these can be used meanwhile
+        save_weights(run.folder / "weights" / f"{name}.json", weights)
     campaign, budget = _campaign(run, start)
     walks = None
     if budget:
@@ -288,14 +289,8 @@ def _tune_sets(run: _Run, net: nets.TrainedNet) -> _Tuned:
         if not walks.sets[0].accepted:
             say(f"`best` is the set that was to be tuned on walks: {walks.reason}")
         sets["best"] = walks.sets[walks.best].weights
-        _save_sets(run, sets)
+        save_weights(run.folder / "weights" / "best.json", sets["best"])
     return _Tuned(net, done, sets, walks)
-
-
-def _save_sets(run: _Run, sets: Mapping[str, Weights]) -> None:
-    """Write the weights of a run."""
-    for name, weights in sets.items():
-        save_weights(run.folder / "weights" / f"{name}.json", weights)
 
 
 def _campaign(run: _Run, start: Weights) -> tuple[Campaign, int]:

@@ -36,7 +36,7 @@ from hector_jax.tuning.evaluate import Evaluation, Walk, evaluate
 from hector_jax.tuning.loss import PAPER_LOSS, Loss
 from hector_jax.tuning.parallel_rollout import parallel_rollout
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
-from hector_jax.tuning.status import Stop
+from hector_jax.tuning.status import StepStatus, Stop
 from hector_jax.tuning.variation import Variation
 
 AXIS = "problems"
@@ -152,11 +152,11 @@ def _evaluate(
     fallen, residual = jnp.max(stacked.fallen), jnp.max(stacked.residual)
     evaluation = Evaluation(loss, terms, gradient, fallen, residual)
     none = jnp.zeros_like(state.rule.matrix)
-    return evaluation, jax.lax.cond(
-        difftune.needs_matrix(config, state, evaluation),
-        lambda: weighted_sum(over_scenarios(curvature)),
-        lambda: none,
-    )
+    if config.rule != "gauss_newton":
+        return evaluation, none
+    accepted = difftune.trial_status(config, state, evaluation) == StepStatus.ACCEPTED
+    matrix = lambda: weighted_sum(over_scenarios(curvature))  # noqa: E731
+    return evaluation, jax.lax.cond(accepted, matrix, lambda: none)
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=COMPILER_OPTIONS)

@@ -373,10 +373,3 @@ def check_start(status: StepStatus, evaluation: Evaluation) -> None:
             f"the starting weights cannot be tuned from: {reason} (try a slower or "
             "shorter trajectory, another gait, or other weights as the start)"
         )
-
-
-def needs_matrix(config: TuneConfig, state: TuneState, evaluation: Evaluation) -> Any:
-    """Return True if `update` uses the matrix at the trial of a state."""
-    if config.rule != "gauss_newton":
-        return False
-    return trial_status(config, state, evaluation) == StepStatus.ACCEPTED

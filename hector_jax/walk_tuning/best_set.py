@@ -63,10 +63,7 @@ def walk_plants(
 
 
 def on_walks(config: TuneConfig) -> TuneConfig:
-    """Return settings for a tuning on walks, which are the robot's own.
-
-    So a small gain is one, and the steps may go further than the model is to be trusted.
-    """
+    """Return settings for a tuning on walks, the robot's own, so that small gains count."""
     return replace(config, ridge=config.ridge / 3.0, least_gain=config.least_gain / 5.0)
 
 

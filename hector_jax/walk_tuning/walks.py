@@ -155,10 +155,10 @@ def from_best_of(pool: Executor, campaign: Campaign, starts: Mapping[str, Weight
         pool, campaign: as for `tune_on_walks`; its own start does not matter.
         starts: weights by name.
     """
-    tried, rows = [], []
+    tried, rows, few = [], [], campaign.plants[:CHOICE_PLANTS]
     for name, start in starts.items():
-        inputs = {"start": start, "plants": campaign.plants[:CHOICE_PLANTS]}
-        one = replace(campaign, folder=campaign.folder / "starts" / name, **inputs)
+        folder = campaign.folder / "starts" / name
+        one = replace(campaign, folder=folder, start=start, plants=few)
         continue_journal(one.folder / RECORD, _head(one), "walks of a start", dict, _remedy(one))
         save_weights(weights_path(one.folder, 0), one.start)
         rows.append([walked.loss for walked in walk_all(pool, one, 0, one.start)])
@@ -261,7 +261,9 @@ def tune_on_walks(
             losses = objective.losses[-1]
             sets.append(WalkedSet(iteration.weights, losses, bool(iteration.accepted)))
             write_record()
-            report_progress(len(sets), config.iterations + 1, _progress(sets))
+            accepted = max((i for i, x in enumerate(sets) if x.accepted), default=0)
+            remark = f"L {changes(sets)[accepted] or 0.0:+.0f} % against the start"
+            report_progress(len(sets), config.iterations + 1, remark)
 
         report_progress(0, config.iterations + 1, "compiling")
         try:
@@ -327,8 +329,3 @@ def log_paths(campaign: Campaign, number: int) -> list[Path]:
     """Return the files of the logs of a set, one for each case."""
     names = [f"{number}-{case}.npz" for case in range(len(campaign.cases))]
     return [campaign.folder / "logs" / name for name in names]
-
-
-def _progress(sets: Sequence[WalkedSet]) -> str:
-    accepted = max((i for i, x in enumerate(sets) if x.accepted), default=0)
-    return f"L {changes(sets)[accepted] or 0.0:+.0f} % against the start"
