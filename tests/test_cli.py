@@ -1,6 +1,7 @@
 """The console script as a person meets it: plain words, exit codes, one line for bad input."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -166,6 +167,9 @@ def test_walks_are_collected_on_either_engine_and_a_net_is_trained_on_them(
 def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     """From nothing to a verdict, small: data, net, two tunings, judges, report."""
     monkeypatch.chdir(tmp_path)
+    # its rollouts are of four seconds: programs as the user has them are sooner done
+    quick = "--xla_backend_optimization_level=0"
+    monkeypatch.setenv("XLA_FLAGS", os.environ["XLA_FLAGS"].replace(quick, ""))
     small = CollectConfig(walks=6, seconds=1.0)
     monkeypatch.setattr(nets, "CollectConfig", lambda: small)
     flags = ("--seeds", "2", "--iterations", "6", "--walk-plants", "1")
@@ -193,6 +197,8 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     assert start == {"change": 0.0, "falls": 0, "accepted": True}
     assert 1 <= len(steps) <= 3  # of the four sets of the budget
     assert len(list((run / "walks" / "logs").glob("*.npz"))) == 1 + len(steps)
+    starts = {path.name for path in (run / "walks" / "starts").iterdir()}
+    assert starts == {"best", "with", "without", "start"}
     report = (run / "report.md").read_text()
     for words in ("hardware stand-in", "## Tuning on walks", "Each weight set walked 1 time "):
         assert words in report

@@ -152,9 +152,8 @@ def kinematic_log(robot, turn):
     t = period * np.arange(1, 401)
     legs = len(robot.foot_point)
     standing = np.asarray(robot.standing_joints)
-    feet = np.asarray(foot_poses(robot, jnp.asarray(standing)).position) - np.asarray(
-        robot.com_offset
-    )
+    reach = foot_poses(robot, jnp.asarray(standing)).position
+    feet = np.asarray(reach) - np.asarray(robot.com_offset)
     pose = lambda t: (  # noqa: E731
         np.stack([0.02 * np.sin(9 * t), 0.01 * np.sin(7 * t), turn * t + 0.01 * np.sin(5 * t)], -1),
         np.stack([0.4 * t, 0.01 * np.sin(8 * t), 0 * t + float(robot.standing_height)], -1),

@@ -47,13 +47,8 @@ from hector_jax.tuning.evaluate import aligned
 from hector_jax.verdict import judging, metrics
 from hector_jax.verdict.judging import ScoredWalks
 from hector_jax.walk_tuning import best_set
-from hector_jax.walk_tuning.walks import (
-    Campaign,
-    WalkTuning,
-    first_slope,
-    from_best_of,
-    tune_on_walks,
-)
+from hector_jax.walk_tuning.campaign import Campaign
+from hector_jax.walk_tuning.walks import WalkTuning, first_slope, from_best_of, tune_on_walks
 
 _ARTEFACTS = "kept"  # folder in it
 
@@ -158,7 +153,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
             run.start,
             first,
             others=[(*run.settings_of_best, tunings.Problem((first.command,), None, 1))],
-            meanwhile=partial(_meanwhile, run),
+            meanwhile=partial(_first_walks, run),
         ):
             say(f"before any tuning, {first.name} on hfs: {line}")
         data = arguments.data_folder(args.data, args.robot, robot)
@@ -217,10 +212,10 @@ def _print(
     print_result(run.args.json, {"run": str(run.folder), "traj": run.name, **result}, print_text)
 
 
-def _meanwhile(run: _Run) -> None:
-    """Do what needs none of the programs of the tunings on the model."""
+def _first_walks(run: _Run) -> None:
+    """Check the start, and begin to compile the programs of the tuning on walks."""
     _check_start(run)
-    campaign, budget = _campaign(run, run.settings_of_best[1])
+    campaign, budget = _campaign(run)
     if budget:
         run.setup.pool.submit(first_slope, campaign)
 
@@ -279,23 +274,22 @@ def _tune_sets(run: _Run, net: nets.TrainedNet) -> _Tuned:
     }
     for name, weights in sets.items():  # a tuning on walks may be long: these can be used meanwhile
         save_weights(run.folder / "weights" / f"{name}.json", weights)
-    campaign, budget = _campaign(run, start)
-    walks = None
+    (campaign, budget), walks = _campaign(run), None
     if budget:
         tuned = {name: sets[name] for name in ("best", "with", "without")}
         starts = {n: w._replace(others={**start.others, **w.others}) for n, w in tuned.items()}
         campaign = from_best_of(setup.pool, campaign, starts | {"start": start})
         walks = tune_on_walks(setup.pool, campaign, walks=budget)
         if not walks.sets[0].accepted:
-            say(f"`best` is the set that was to be tuned on walks: {walks.reason}")
+            say(f"no steps on walks: {walks.reason}")
         sets["best"] = walks.sets[walks.best].weights
         save_weights(run.folder / "weights" / "best.json", sets["best"])
     return _Tuned(net, done, sets, walks)
 
 
-def _campaign(run: _Run, start: Weights) -> tuple[Campaign, int]:
-    """Return the tuning of `best` on walks, from the result of that on the model; its budget."""
-    robot, args, (config, _) = run.setup.robot, run.args, run.settings_of_best
+def _campaign(run: _Run) -> tuple[Campaign, int]:
+    """Return the tuning of `best` on walks, from the start of that on the model, and its budget."""
+    robot, args, (config, start) = run.setup.robot, run.args, run.settings_of_best
     plants, budget = best_set.walk_plants(robot, args.walk_plants, args.walks, len(run.commands))
     settings = best_set.on_walks(config)
     inputs = run.folder / "walks", settings, robot, start, run.commands, plants

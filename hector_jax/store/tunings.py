@@ -149,7 +149,7 @@ def _tune_on_gpu(setup: Setup, start: Weights, problem: Problem) -> Tuning:
     models, losses = rollouts_of(config, robot, problem), np.ones(1)
     if len(models) > 1:
         at = difftune.init(config, start).start
-        found = [difftune.model_slope(config, model, at)[0] for model in models]
+        found = [difftune.tune_step(config, model, at) for model in models]
         models, losses = _usable(config, problem, models, found)
     effects = [model.effect for model in (models if problem.draws else models[:1])]
     scenarios = [
@@ -337,8 +337,7 @@ def compile_programs(
     walking = pool.submit(
         not_the_weights, config.rollout.walk, jax.tree.map(np.asarray, robot), job
     )
-    plain = config, start, Problem((trajectory.command,), None)
-    preparing = []
+    preparing, plain = [], (config, start, Problem((trajectory.command,), None))
     for settings, weights, problem in (plain, *others):
         scenario, *_ = rollouts_of(settings, robot, problem)
         at = jax.tree.map(np.asarray, difftune.init(settings, weights).start)

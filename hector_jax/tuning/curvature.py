@@ -1,8 +1,8 @@
-"""Directions of the weights that matter: eigenvectors of the loss's Gauss-Newton matrix.
+"""The loss of a rollout as least squares: its slope, and the directions of the weights that matter.
 
 The loss is a sum of squares of residuals, so along a step s in the log-weights it is curved by
-s' H s with H = 2 J' J, where J is the derivative of the residuals. A direction of H with a small
-eigenvalue changes neither walk nor loss.
+s' H s with H = 2 J' J, where J is the derivative of the residuals. The directions are eigenvectors
+of H: one with a small eigenvalue changes neither walk nor loss.
 """
 
 from collections.abc import Sequence

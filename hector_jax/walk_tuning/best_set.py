@@ -22,8 +22,7 @@ LIMIT, WIDTH, FEEDBACK = 0.19, 7 / 8, 2 / 3
 centre of mass, unless one is given; width and velocity feedback of the steps as shares of the
 controller's. With them fewer walks fall under pushes and on slippery floors."""
 PLANTS, SETS = 12, 4
-"""Drawn plants on which `best` walks, and weight sets that walk there: the result on the model and
-three steps."""
+"""Drawn plants on which `best` walks, and sets that walk there: the start and three steps."""
 MANY_SETS, MOST_PLANTS = 8, 16  # of a larger budget of walks, unless plants are given
 _FIRST_SEED = 7000  # of the plants on which `best` walks
 
@@ -63,7 +62,7 @@ def walk_plants(
 
 
 def on_walks(config: TuneConfig) -> TuneConfig:
-    """Return settings for a tuning on walks, the robot's own, so that small gains count."""
+    """Return settings for a tuning on walks: they are the robot's own, so it may go further."""
     return replace(config, ridge=config.ridge / 3.0, least_gain=config.least_gain / 5.0)
 
 

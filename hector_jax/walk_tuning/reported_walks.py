@@ -65,7 +65,7 @@ def read_reports(pool: Executor, campaign: Campaign) -> Reports:
     while all(path.exists() for path in walks.log_paths(campaign, number)):
         walked = load_weights(walks.weights_path(campaign.folder, number), campaign.robot)
         if tree_hash(walked) == tree_hash(best):  # else a step of a tuning by another loss
-            again.append(np.array([walked.loss for walked in ask(number, best)]))
+            again.append(np.array([log.loss for log in ask(number, best)]))
         number += 1
     save_weights(walks.weights_path(campaign.folder, number), best)
     return Reports(tuning, best, number, _again(tuning, again) if again else None)

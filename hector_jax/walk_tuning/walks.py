@@ -10,6 +10,7 @@ uses is in a folder, so that it begins anew in each call and no walk is made twi
 - `walks.jsonl`: the settings, then a line for each weight set that has walked.
 - `weights/3.json`: the weights of set 3.
 - `logs/3-0.npz`: its log in case 0, at the plan interval, or the file that was reported.
+- `starts/with`: the same of a set that was tried as the start.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +30,7 @@ from hector_jax.control import parameters
 from hector_jax.control.reference import standing_anchor
 from hector_jax.control.weights import Weights
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
-from hector_jax.core.console import bar
+from hector_jax.core.console import bar, say
 from hector_jax.core.environment import code_hash
 from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError, plural
@@ -141,8 +142,7 @@ def _slope(
 
 def first_slope(campaign: Campaign) -> None:
     """Walk the start in the first case, so that the programs of the others are in the cache."""
-    start = difftune.init(campaign.config, campaign.start).start
-    _slope(campaign, start, 0, walk_case(campaign, start, 0).log)
+    _slope(campaign, campaign.start, 0, walk_case(campaign, campaign.start, 0).log)
 
 
 def from_best_of(pool: Executor, campaign: Campaign, starts: Mapping[str, Weights]) -> Campaign:
@@ -156,17 +156,19 @@ def from_best_of(pool: Executor, campaign: Campaign, starts: Mapping[str, Weight
         starts: weights by name.
     """
     tried, rows, few = [], [], campaign.plants[:CHOICE_PLANTS]
-    for name, start in starts.items():
-        folder = campaign.folder / "starts" / name
-        one = replace(campaign, folder=folder, start=start, plants=few)
-        continue_journal(one.folder / RECORD, _head(one), "walks of a start", dict, _remedy(one))
-        save_weights(weights_path(one.folder, 0), one.start)
-        rows.append([walked.loss for walked in walk_all(pool, one, 0, one.start)])
-        tried.append(one)
-    losses = np.array(rows)
-    stood = np.isfinite(losses)
-    means = np.log(losses, where=stood, out=np.zeros_like(losses)).sum(axis=1)
-    best = tried[np.lexsort((means, -stood.sum(axis=1)))[0]]
+    with bar("walking with each set that the tuning on walks may begin with") as report_progress:
+        for name, start in starts.items():
+            report_progress(len(tried), len(starts), name)
+            folder = campaign.folder / "starts" / name
+            one = replace(campaign, folder=folder, start=start, plants=few)
+            continue_journal(folder / RECORD, _head(one), "walks of a start", dict, _remedy(one))
+            save_weights(weights_path(folder, 0), one.start)
+            rows.append([walked.loss for walked in walk_all(pool, one, 0, one.start)])
+            tried.append(one)
+    stood = np.isfinite(losses := np.array(rows))
+    sums = np.log(losses, where=stood, out=np.zeros_like(losses)).sum(axis=1)
+    best = tried[np.lexsort((sums, -stood.sum(axis=1)))[0]]
+    say(f"it begins with `{best.folder.name}`")
     for path, kept in zip(log_paths(best, 0), log_paths(campaign, 0), strict=False):
         write_file(kept, path.read_bytes())
     return replace(campaign, start=best.start)
