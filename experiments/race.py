@@ -36,7 +36,7 @@ from hector_jax.core.console import bar, exit_code
 from hector_jax.core.files import make_folder
 from hector_jax.core.identity import function_id
 from hector_jax.core.runtime import setup_jax, workers
-from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, SEED, Range, check
+from hector_jax.core.settings import AT_LEAST_ONE, SEED, Range, check
 from hector_jax.grfm.network import effect_of
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import load_robot
@@ -45,10 +45,10 @@ from hector_jax.sim.world import hfs, named_world
 from hector_jax.store import tunings
 from hector_jax.store.cache import content_key, load_or_make
 from hector_jax.store.setup import Setup
-from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import Loss, loss_of
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.verdict import judging, metrics
+from hector_jax.walk_tuning import best_set
 from hector_jax.walk_tuning.campaign import Campaign
 from hector_jax.walk_tuning.walks import tune_on_walks, walk_case
 
@@ -65,7 +65,6 @@ class Flags:
     rivals: tuple[str, ...] = tuple(RIVALS)
     walks: Annotated[int, Range(2)] = BUDGETS[-1]  # of each contest
     repeats: Annotated[int, AT_LEAST_ONE] = 8  # seeds of each rival
-    ridge: Annotated[float, NOT_NEGATIVE] = TuneConfig.ridge  # of the tuner
     plants: Annotated[int, AT_LEAST_ONE] = 16  # of hfs-varied, that judge the set of the tuner
     first_plant: Annotated[int, SEED] = 300
     engine: str = "c"  # what walks, one of `hector walk --engine` but mjx
@@ -178,8 +177,8 @@ def main() -> None:
     flags = tyro.cli(Flags)
     setup_jax()
     robot, engine = jax.tree.map(np.asarray, load_robot(flags.robot)), choose_engine(flags.engine)
-    config, command = tunings.tune_config(robot, ridge=flags.ridge), named_command(flags.traj)
-    folder = flags.out / f"{TUNER}-{flags.ridge:g}"
+    config, command = best_set.on_walks(tunings.tune_config(robot)), named_command(flags.traj)
+    folder = flags.out / TUNER
     make_folder(folder)
     inputs = folder, config, robot, nominal(robot), {flags.traj: command}, [hfs(robot.description)]
     with workers(flags.processes) as pool:
@@ -189,7 +188,7 @@ def main() -> None:
     entries = {name: entry(each) for name, each in losses.items()}
     own = {name: each["own"] for name, each in entries.items()}
     intro = (
-        f"{flags.traj} from nominal, engine {engine.title}, ridge {flags.ridge:g}. L of the best "
+        f"{flags.traj} from nominal, engine {engine.title}. L of the best "
         "set so far on the simulator's own plant after some walks, mean over the seeds [1e6], and "
         "the mean number of falls."
     )

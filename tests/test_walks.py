@@ -379,25 +379,21 @@ def test_a_fall_is_a_bounded_loss_of_its_case_and_has_no_slope(toy):
     slopes = [np.asarray(weights_to_vector(toy_slope(one, at, c, LOG)[0].gradient)) for c in (0, 2)]
     expected = value / 3.0 * sum(g / start[c] for g, c in zip(slopes, (0, 2), strict=True))
     np.testing.assert_allclose(weights_to_vector(found.gradient), expected, rtol=1e-12)
-    assert float(found.fallen) == 0.0
+    assert float(found.fallen) == 1.0  # it falls in more cases than the start
 
 
-@pytest.mark.parametrize("falls_again", [False, True])
-def test_a_set_that_falls_in_one_of_several_cases_may_be_a_step_but_is_not_the_best(
-    toy, falls_again
-):
+def test_a_set_that_falls_in_more_cases_than_the_start_is_refused(toy):
+    """Though its loss is lower; the shorter steps that follow are taken if they stand."""
+
     def fell(number, case, weights):
-        return case == 0 and (number > 0 if falls_again else number == 1)
+        return case == 0 and number in (1, 3)
 
-    found = walks.tune_on_walks(Here(), toy(cases=4), partial(asked, cases=4, fell=fell), 16)
-    falls = [int(x.fell.sum()) for x in found.sets]
-    assert falls[:2] == [0, 1]
-    assert found.sets[1].accepted
+    found = walks.tune_on_walks(Here(), toy(cases=4), partial(asked, cases=4, fell=fell), 20)
+    assert [int(x.fell.sum()) for x in found.sets[:4]] == [0, 1, 0, 1]
+    assert [x.accepted for x in found.sets[:4]] == [True, False, True, False]
     assert found.rows[1]["change"] < -10.0  # over the cases in which it stood
+    assert found.best == max(i for i, x in enumerate(found.sets) if x.accepted)
     assert found.sets[found.best].fell.sum() == 0
-    assert (found.best == 0) == falls_again
-    accepted = [i for i, x in enumerate(found.sets) if x.accepted]
-    assert (found.best == accepted[-1]) != falls_again
 
 
 def test_a_set_that_falls_in_all_cases_is_refused_and_a_shorter_step_follows(toy):

@@ -4,8 +4,9 @@ A weight set walks in each case, a command on a plant; its value is the mean of 
 cases. Gradient and Gauss-Newton matrix are those of the rigid body grounded on each of these walks
 (tuning/grounded.py), each divided by its loss. Steps, acceptance and stop are those of
 `difftune.descend`. A fall counts as a bounded loss of its case and has no slope; the rest still
-steers. Whether a simulator (`walk_all`) or a real robot (`reported_walks`) walks, all that the loop
-uses is in a folder, so that it begins anew in each call and no walk is made twice:
+steers. A set that falls in more cases than the start is refused. Whether a simulator (`walk_all`)
+or a real robot (`reported_walks`) walks, all that the loop uses is in a folder, so that it begins
+anew in each call and no walk is made twice:
 
 - `walks.jsonl`: the settings, then a line for each weight set that has walked.
 - `weights/3.json`: the weights of set 3.
@@ -91,10 +92,8 @@ class WalkTuning(NamedTuple):
 
     @property
     def best(self) -> int:
-        """Number of the last accepted set that falls in no more cases than the start."""
-        most = self.sets[0].fell.sum()
-        steps = (i for i, x in enumerate(self.sets) if x.accepted and x.fell.sum() <= most)
-        return max(steps, default=0)
+        """Number of the last accepted set."""
+        return max((i for i, x in enumerate(self.sets) if x.accepted), default=0)
 
 
 class Waiting(Exception):  # noqa: N818
@@ -221,11 +220,12 @@ class _Walks:
 
         numbers = len(parameters.step_names(weights, campaign.config.others))
         gradient, matrix = jax.tree.map(np.zeros_like, weights), np.zeros((numbers, numbers))
-        residual, fallen = 0.0, float(not usable)
+        residual, falls = 0.0, [int(np.isinf(each).sum()) for each in self.losses]
         if usable:
             gradient, matrix = mean([(found.gradient, matrix) for found, matrix in usable])
             residual = np.max([found.residual for found, _ in usable])
-        checks = np.asarray(fallen), np.asarray(residual)
+        fallen = np.asarray(float(falls[-1] > falls[0] or not usable))
+        checks = fallen, np.asarray(residual)
         return Evaluation(np.asarray(value), {}, gradient, *checks), matrix
 
 
@@ -263,8 +263,8 @@ def tune_on_walks(
             losses = objective.losses[-1]
             sets.append(WalkedSet(iteration.weights, losses, bool(iteration.accepted)))
             write_record()
-            accepted = max((i for i, x in enumerate(sets) if x.accepted), default=0)
-            remark = f"L {changes(sets)[accepted] or 0.0:+.0f} % against the start"
+            best = WalkTuning(sets, None, "").best
+            remark = f"L {changes(sets)[best] or 0.0:+.0f} % against the start"
             report_progress(len(sets), config.iterations + 1, remark)
 
         report_progress(0, config.iterations + 1, "compiling")
