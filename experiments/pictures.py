@@ -55,7 +55,7 @@ OUT = ROOT / "docs" / "pictures"
 RACE = ROOT / "experiments" / "reports" / "race" / "nominal" / "race.json"
 CLOSE_NOTICES = "document.querySelectorAll('.mantine-CloseButton-root').forEach(x => x.click())"
 METHODS = {  # of the race, by plain names, with their lines
-    "nominal walks": ("the method of hector tune --walks", {"color": "#00805f", "linewidth": 2.2}),
+    "tuner": ("hector tune --walks", {"color": "#00805f", "linewidth": 2.2}),
     "nominal turbo on model": (
         "Bayesian optimisation (TuRBO with our model)",
         {"color": "#e07c24", "linestyle": (0, (5, 1.5))},
