@@ -89,7 +89,7 @@ def test_strider_is_tuned_by_the_same_command_and_a_run_knows_its_robot(
     assert call(monkeypatch, "tune", "--robot", STRIDER, *flags, "--processes", 1) == 0
     assert len(load_walks(tmp_path / "data" / "strider" / "walks", strider).job.seed) == 6
     assert (tmp_path / "data" / "strider" / "grfm.npz").exists()
-    with pytest.raises(ValueError, match="made for robot"):
+    with pytest.raises(ValueError, match="made for another robot"):
         load_walks(tmp_path / "data" / "strider" / "walks", load_robot())
     (run,) = (tmp_path / "runs" / "strider" / "straight").iterdir()
     assert find_weights(run, "with") == run / "weights" / "with.json"

@@ -75,3 +75,11 @@ def test_what_is_no_finished_run_is_told_by_its_file(runs, name, text, fault):
     with pytest.raises(ValueError, match=fault) as told:
         compare_runs([load_run(folder) for folder in runs])
     assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(("alpha", "said"), [("paper", 0), ("auto", 1)])
+def test_runs_of_different_losses_are_said_to_be_so(monkeypatch, capsys, tmp_path, alpha, said):
+    flags = Tune(), Tune(alpha=alpha, seeds=32)
+    runs = [run_folder(tmp_path / str(i), each, {}) for i, each in enumerate(flags)]
+    assert call(monkeypatch, "compare", *runs) == 0
+    assert capsys.readouterr().out.count("losses differ") == said

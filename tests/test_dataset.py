@@ -172,7 +172,7 @@ def test_a_collection_of_something_else_is_not_overwritten(tmp_path):
         with pytest.raises(ValueError, match=f": {fault}"):
             collect(tmp_path, jobs, walker([]), robot=ROBOT, settings=settings)
     assert (tmp_path / "walk-00000.npz").read_bytes() == before
-    with pytest.raises(ValueError, match="walk-00000.npz: made for robot"):
+    with pytest.raises(ValueError, match="walk-00000.npz: made for another robot"):
         load_walks(tmp_path, ROBOT._replace(mass=np.asarray(13.0)))
     (tmp_path / "card.json").unlink()  # nothing tells whose walks these are
     with pytest.raises(ValueError, match="has walks but no card.json"):

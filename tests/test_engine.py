@@ -13,6 +13,7 @@ from pretend import call
 from hector_jax.control.reference import standing_anchor
 from hector_jax.core.inputs import InputError
 from hector_jax.grfm.effect import last_command
+from hector_jax.report import pictures
 from hector_jax.sim.engine import ENGINES, MJX, MUJOCO_C, Engine, choose_engine
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 
@@ -51,6 +52,15 @@ def test_a_package_of_the_same_name_of_other_people_is_named(monkeypatch):
     monkeypatch.setitem(ENGINES, "pinocchio", ENGINES["pinocchio"]._replace(package="mujoco"))
     with pytest.raises(InputError, match=r"pin>=4.1'\) is expected, other.py is another"):
         choose_engine("pinocchio")
+
+
+def test_the_film_of_a_walk_shows_the_plant_that_walked(monkeypatch, capsys, tmp_path):
+    filmed = []
+    monkeypatch.setattr(pictures, "film", lambda path, robot, walks: filmed.append(robot))
+    for flags in ([], ["--plant", str(ARMS)]):
+        words = ("walk", "--world", "ideal", "--seconds", "0.1", "--video", tmp_path / "film.mp4")
+        assert call(monkeypatch, *words, *flags) == 0
+    assert [robot.description.name for robot in filmed] == ["hector", "hector-v2-arms"]
 
 
 def test_a_walk_and_an_evaluation_take_an_engine_that_was_added(monkeypatch, capsys):

@@ -58,7 +58,7 @@ WIDER = TREE | {"leaf": TREE["leaf"]._replace(force=np.zeros((2, 4)))}
     ("like", "kind", "robot", "format", "fault"),
     [
         (TREE, "net", None, 1, "holds thing, expected net"),
-        (TREE, "thing", OTHER_ROBOT, 1, "made for robot"),
+        (TREE, "thing", OTHER_ROBOT, 1, "made for another robot"),
         (SMALLER, "thing", None, 1, "another layout of thing.*count"),
         (WIDER, "thing", None, 1, r"leaf.force has shape \(2, 3\)"),
         (TREE, "thing", None, 2, "file format 1, this version reads 2"),

@@ -103,7 +103,7 @@ def test_metrics_of_a_run_that_goes_on_are_read_and_its_newest_weights_taken(tmp
     assert [i.accepted for i in found["with"]] == [k != 3 for k in range(7)]
     curve = runs.loss_curves(found)["with"]
     assert np.isnan(curve[3])
-    assert curve[6] < curve[0]
+    assert curve[6] < curve[0] == 100.0
     for expected, words in ((nominal(), "with at iteration 6, so far"), (expert(), "with")):
         weights, told = runs.weights_of(run, "with")
         np.testing.assert_array_equal(weights_to_vector(weights), weights_to_vector(expected))

@@ -154,7 +154,7 @@ def run_walk(args: Walk) -> None:
         other = arguments.engine_of(replace(args, out=None))  # the log is that of the asked walk
         before = walk_with(arguments.weights_by_name(baseline, robot), engine=other)
         walks = {baseline: before, name: trajectory}
-        pictures.film(args.video, robot, walks)
+        pictures.film(args.video, plant or robot, walks)
 
 
 def _print_walk(

@@ -80,7 +80,7 @@ def bar(title: str) -> Iterator[ReportProgress]:
             first = done, now
         if now - last >= _QUIET and remark != "compiling":
             text, last = f"  {done}/{total} after {now - start:.0f} s", now
-            if first and done > first[0]:
+            if first and first[0] < done < total:
                 left = (now - first[1]) / (done - first[0]) * (total - done)
                 text += f", about {left:.0f} s left"
             say(f"{text}  {remark}".rstrip())

@@ -97,10 +97,8 @@ def load_tree(
             kind, format, layout or robot.
     """
     arrays, card = _read(path, kind)
-    if robot is not None and card["robot"] != (expected := tree_hash(robot, ROBOT_DIGITS)):
-        raise InputError(
-            f"{path}: made for robot {card['robot']}, the robot in use is {expected}; make it anew"
-        )
+    if robot is not None and card["robot"] != tree_hash(robot, ROBOT_DIGITS):
+        raise InputError(f"{path}: made for another robot than the one in use; make it anew")
     leaves = named_leaves(like)
     if arrays.keys() != leaves.keys():
         differences = one_line(", ".join(sorted(arrays.keys() ^ leaves.keys())))

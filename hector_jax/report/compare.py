@@ -97,7 +97,7 @@ def print_comparison(comparison: Mapping[str, Any], console: Console | None = No
         texts = (count and f"{count['iterations']} ({count['refused']})" for count in counts)
         add(f"{name}: iterations (refused)", texts)
     seconds = [run["seconds"] for run in runs]
-    add("time [s]", (None if s is None else f"{s:.0f}" for s in seconds))
+    add("time of the last call [s]", (None if s is None else f"{s:.0f}" for s in seconds))
     add("commit", (re.sub(r"^(\w{10})\w*", r"\1", r["versions"].get("commit", "-")) for r in runs))
     for kind, rows in differ.items():
         table.add_section()
@@ -105,6 +105,8 @@ def print_comparison(comparison: Mapping[str, Any], console: Console | None = No
             if name != "commit":
                 add(f"{kind}: {name}", values)
     console.print(table)
+    if "flags.alpha" in differ["settings"] or any("loss" in x for x in differ["settings"]):
+        console.print("The losses differ (see the settings), so that their L cannot be compared.")
     if len(runs) > 1 and not any(differ.values()):
         console.print("All settings and versions are the same.")
     note = (

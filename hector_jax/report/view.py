@@ -227,7 +227,9 @@ class Page:
             labels |= {"force": "forces", "moment": "moments"}
             self._boxes = {n: gui.add_checkbox(text, n != "moment") for n, text in labels.items()}
         with gui.add_folder("Tuning"):
-            self._losses = _plot(gui, "L on the model [1e6]", "iteration", np.zeros(1), _NO_CURVES)
+            self._losses = _plot(
+                gui, "loss on the model [% of the start]", "iteration", np.zeros(1), _NO_CURVES
+            )
             self._progress = gui.add_markdown("")
         with gui.add_folder("Distance from the reference"):
             lines = [100.0 * motion.distance[: self._length] for motion in self._motions]

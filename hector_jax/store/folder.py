@@ -231,10 +231,14 @@ def _newest(histories: Histories) -> dict[str, Iteration]:
 
 
 def loss_curves(histories: Histories) -> dict[str, Float[np.ndarray, " n"]]:
-    """Return L in 1e6 by iteration, NaN if rejected and as padding to the longest history."""
+    """Return the loss by iteration in % of its start, NaN if rejected and beyond the last.
+
+    The tunings minimise different losses, so that their values cannot be compared.
+    """
     count, curves = max(map(len, histories.values()), default=0), {}
     for name, history in histories.items():
-        losses = [i.evaluation.loss / 1e6 if i.accepted else np.nan for i in history]
+        whole = history[0].evaluation.loss / 100.0
+        losses = [i.evaluation.loss / whole if i.accepted else np.nan for i in history]
         curves[name] = np.array(losses + [np.nan] * (count - len(losses)))
     return curves
 
