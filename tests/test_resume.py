@@ -17,6 +17,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from pretend import call
 
 from hector_jax.cli import flags, run_folder
 from hector_jax.cli import tune as command
@@ -160,6 +161,41 @@ def test_a_disk_without_locks_is_locked_by_a_file(tmp_path, monkeypatch):
     monkeypatch.setattr(core_files, "SoftFileLock", core_files.FileLock)
     with pytest.raises(InputError, match="cannot lock .*: No locks available; name a folder on"):
         locked(tmp_path).__enter__()
+
+
+_HOLD = """
+import sys
+from pathlib import Path
+from hector_jax.core.files import locked
+with locked(Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "folder"),
+    [
+        (("collect", "--walks", "3", "--out", "walks"), "walks"),
+        (("train", "--data", "walks"), "."),
+        (("verdict", "--out", "judged"), "judged"),
+        (("propose", "reported"), "reported"),
+    ],
+)
+def test_each_writer_of_a_folder_waits_for_the_one_before(monkeypatch, tmp_path, words, folder):
+    def say(text):
+        if "another process is writing there" in text:
+            raise InterruptedError(text)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(core_files, "say", say)
+    holding = [sys.executable, "-c", _HOLD, folder]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(holding, **pipes) as holder:
+        assert holder.stdout.readline() == "held\n"
+        with pytest.raises(InterruptedError, match=re.escape(f"{folder}: another")):
+            call(monkeypatch, *words)
+        holder.stdin.close()
 
 
 @pytest.mark.parametrize("code", [errno.ENOLCK, errno.EROFS, errno.EMFILE])
