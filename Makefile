@@ -41,7 +41,7 @@ verdict: $(STAMP) ## sets in all engines and models: make verdict WEIGHTS="nomin
 	@$(BIN)/hector verdict --engine all $(MODELS) --weights $(or $(WEIGHTS),nominal expert best)
 
 grfm: $(STAMP) ## how well the nets predict the ground forces: runs/grfm/report.md
-	@$(BIN)/hector grfm
+	@$(BIN)/hector steps grfm
 
 test: $(STAMP) ## the fast tests
 	@$(BIN)/pytest -q -n 2 --dist loadfile

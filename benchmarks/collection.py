@@ -2,7 +2,7 @@
 
 A batch is walked twice; the first pass compiles, the second is timed from the call that starts it
 to the last walk on the host. Building the plants' models is told apart, as it is done once. The
-jobs are those that `hector collect` draws, start-up included in the count.
+jobs are those that `hector steps collect` draws, start-up included in the count.
 """
 
 import argparse

@@ -33,18 +33,43 @@ def test_help_opens_with_what_is_typed_first_and_names_each_command_once():
     words = [sys.executable, "-m", "hector_jax"]
     shown = subprocess.run(words, capture_output=True, text=True)
     assert (shown.returncode, shown.stderr) == (0, "")
-    rows = re.findall(r"^  (\w+) +\S", shown.stdout, re.MULTILINE)
+    rows = re.findall(r"^  (\w+(?: \w+)?) +\S", shown.stdout, re.MULTILINE)
     assert rows[:6] == ["tune", "view", "export", "robot", "walk", "evaluate"]
     assert sorted(rows) == sorted(COMMANDS)
     assert max(map(len, shown.stdout.splitlines())) < 88
     assert "hector tune --traj straight" in shown.stdout.splitlines()[2]
 
 
+@pytest.mark.parametrize("words", [["log"], ["log", "--help"], ["-h", "steps"]])
+def test_a_first_word_of_two_shows_the_commands_that_begin_with_it(monkeypatch, capsys, words):
+    with pytest.raises(SystemExit) as left:
+        call(monkeypatch, *words)
+    assert left.value.code == 0
+    (top,) = {"log", "steps"} & {*words}
+    rows = re.findall(r"^  (\w+ \w+) +\S", capsys.readouterr().out, re.MULTILINE)
+    assert rows == [name for name in rows if name.startswith(f"{top} ")]
+    assert len(rows) == 3
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("check x.npz", "unknown command 'check'; it is `hector log check` now"),
+        ("report runs x.npz", "unknown command 'report'; it is `hector log add` now"),
+        ("train", "unknown command 'train'; it is `hector steps train` now"),
+        ("log chekc x.npz", "unknown command 'log chekc'; did you mean 'log check'?"),
+        ("eval", "unknown command 'eval'; did you mean 'evaluate'?"),
+    ],
+)
+def test_an_unknown_command_is_told_with_the_nearest(monkeypatch, capsys, line, said):
+    assert refused(monkeypatch, capsys, *line.split()) == f"hector: {said}"
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_help_tells_each_flag_and_gives_an_example(monkeypatch, capsys, name):
     monkeypatch.setenv("COLUMNS", "200")
     with pytest.raises(SystemExit) as left:
-        call(monkeypatch, name, "--help")
+        call(monkeypatch, *name.split(), "--help")
     assert left.value.code == 0
     shown = capsys.readouterr().out
     assert f"Example: hector {name}" in shown
@@ -121,12 +146,12 @@ def test_a_step_with_settings_of_its_own_leaves_what_a_tuning_reads(monkeypatch,
     instead(monkeypatch, nets, "train_net", lambda *args: paths.append(args[-1]) or trained)
     instead(monkeypatch, nets, "collect_walks", lambda *args: paths.append(args[-1]))
     for line in ("", "--epochs 5", "--data data/more", "--variant paper --seed 2", "--out a.npz"):
-        assert call(monkeypatch, "train", *line.split(), "--json") == 0
+        assert call(monkeypatch, "steps", "train", *line.split(), "--json") == 0
     found = "data/grfm data/grfm-epochs-5 data/grfm-more data/grfm-paper-seed-2 a".split()
     assert paths == [Path(f"{name}.npz") for name in found]
     paths.clear()
     for line in ("", "--engine c", "--walks 128", "--walks 128 --out data/walks"):
-        assert call(monkeypatch, "collect", *line.split()) == 0
+        assert call(monkeypatch, "steps", "collect", *line.split()) == 0
     assert list(map(str, paths)) == ["data/walks"] * 2 + ["data/walks-walks-128", "data/walks"]
 
 
@@ -149,7 +174,7 @@ def test_walks_are_collected_on_either_engine_and_a_net_is_trained_on_them(
     monkeypatch, capsys, tmp_path, engine
 ):
     monkeypatch.setattr(nets, "tuning_paths", lambda *args: [])
-    walks, flags = tmp_path / "walks", ("collect", "--walks", "5", "--seconds", "0.1")
+    walks, flags = tmp_path / "walks", ("steps", "collect", "--walks", "5", "--seconds", "0.1")
     assert call(monkeypatch, *flags, "--engine", engine, "--out", walks) == 0
     settings = json.loads((walks / "card.json").read_text())["settings"]
     assert settings["engine"].split()[0] == engine
@@ -157,7 +182,7 @@ def test_walks_are_collected_on_either_engine_and_a_net_is_trained_on_them(
     assert call(monkeypatch, *flags, "--engine", other, "--out", walks) == 2
     capsys.readouterr()
     flags = ("--data", walks, "--out", tmp_path / "net.npz", "--epochs", "1", "--json")
-    assert call(monkeypatch, "train", *flags) == 0
+    assert call(monkeypatch, "steps", "train", *flags) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["net"] == str(tmp_path / "net.npz")
     assert {"raw", "net"} <= told["errors"].keys()
@@ -236,7 +261,7 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     assert "walks" not in result
 
     # the nets of these data
-    assert call(monkeypatch, "grfm", "--seeds", "0", "--json") == 0
+    assert call(monkeypatch, "steps", "grfm", "--seeds", "0", "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert {"raw", "paper", "residual"} <= told["worlds"]["hfs"]["errors"].keys()
     assert (tmp_path / told["report"]).exists()

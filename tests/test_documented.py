@@ -41,7 +41,9 @@ ELSEWHERE = ("--cluster", "--help", "doctor")  # a scheduler; no work; the machi
 
 def words_of(line):
     """The words of a line as they are run here."""
-    command, *words = shlex.split(line, comments=True)[1:]
+    first, *words = shlex.split(line, comments=True)[1:]
+    top = [first] if first in ("log", "steps") else []
+    command = words.pop(0) if top else first
     small = shlex.split(SMALL.get(command, ""))
     for flag in {"--seeds", "--walks", "--engine"} & {*small, *words}:
         if flag in small and flag in words:
@@ -60,7 +62,7 @@ def words_of(line):
     words = [one for word in words for one in found(word, files)]
     if command in SECONDS and "--seconds" not in words and "short/" not in " ".join(words):
         small += ["--seconds", str(SECONDS[command])]
-    return [command, *words, *small]
+    return [*top, command, *words, *small]
 
 
 def found(word, files):
@@ -108,11 +110,11 @@ PAIRS = [
 ]
 """Lines of flags that meet in the code, in an order in which each has its input."""
 INPUTS = {
-    "hector report runs/robot log.npz": "hector walk --weights runs/robot/weights/0.json --traj s "
+    "hector log add runs/robot log.npz": "hector walk --weights runs/robot/weights/0.json --traj s "
     "--out log.npz",
-    "hector report runs/robot s.npz": "hector walk --weights runs/robot/weights/0.json --traj s "
+    "hector log add runs/robot s.npz": "hector walk --weights runs/robot/weights/0.json --traj s "
     "--out s.npz",
-    "hector check mine.npz --traj straight": "hector walk --traj straight --seconds 1.5 "
+    "hector log check mine.npz --traj straight": "hector walk --traj straight --seconds 1.5 "
     "--out mine.npz",
     "hector evaluate --walker mine.py --robot mine.toml --traj c --weights mine.json best.json": ""
     "hector walk --walker mine.py --robot mine.toml --out log.npz",
@@ -142,7 +144,7 @@ def console(tmp_path_factory):
     own, four = ROOT / "examples" / "own_controller", ROOT / "examples" / "quadruped"
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("reader"))
-        asked = nets.CollectConfig  # with numbers, by `hector collect`
+        asked = nets.CollectConfig  # with numbers, by `hector steps collect`
         patch.setattr(nets, "CollectConfig", lambda *given: asked(*given) if given else small)
         patch.setattr(nets, "TrainConfig", TwoEpochs)
         patch.setattr(nets, "tuning_paths", lambda *_, **__: [])

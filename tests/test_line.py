@@ -70,7 +70,7 @@ def test_every_number_has_an_upper_bound_that_is_told(monkeypatch, capsys, comma
     """Nothing is made of the number before: a list of 10**12 jobs would take all memory."""
     kind = {field.name: field for field in fields(COMMANDS[command])}
     required = [each for each, field in kind.items() if field.default is MISSING]
-    words = [command, *(__file__ if each == "logs" else "." for each in required)]
+    words = [*command.split(), *(__file__ if each == "logs" else "." for each in required)]
     line = refused(monkeypatch, capsys, *words, f"--{name.replace('_', '-')}", 10**12)
     rule = get_args(kind[name].type)[1]
     assert f"from {rule.low} to {rule.high}, got 1000000000000" in line
@@ -85,7 +85,7 @@ def test_every_number_has_an_upper_bound_that_is_told(monkeypatch, capsys, comma
     ids=["missing", "pipe"],
 )
 @pytest.mark.parametrize(
-    ("words", "name"), [(["walk", "--weights"], "own.json"), (["report", "runs"], "own.npz")]
+    ("words", "name"), [(["walk", "--weights"], "own.json"), (["log", "add", "runs"], "own.npz")]
 )
 def test_a_file_that_cannot_be_read_is_told_before_anything_is_loaded(
     tmp_path, make, fault, words, name
@@ -102,7 +102,9 @@ def test_a_file_that_cannot_be_read_is_told_before_anything_is_loaded(
     assert shown.stderr == f"hector: {tmp_path / name}: cannot read the file: {fault}\n"
 
 
-@pytest.mark.parametrize("words", ["tune --data", "tune --runs", "grfm --out", "collect --out"])
+@pytest.mark.parametrize(
+    "words", ["tune --data", "tune --runs", "steps grfm --out", "steps collect --out"]
+)
 def test_a_folder_that_cannot_be_one_is_told_before_anything_is_made(
     monkeypatch, capsys, tmp_path, words
 ):
@@ -110,7 +112,7 @@ def test_a_folder_that_cannot_be_one_is_told_before_anything_is_made(
     Path("file").write_text("")
     for name in ("/dev/null", "file", "file/below"):
         line = refused(monkeypatch, capsys, *words.split(), name)
-        assert line == f"hector: {words.split()[1]} must be a folder, got {name!r}"
+        assert line == f"hector: {words.split()[-1]} must be a folder, got {name!r}"
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 

@@ -176,8 +176,8 @@ with locked(Path(sys.argv[1])):
 @pytest.mark.parametrize(
     ("words", "folder"),
     [
-        (("collect", "--walks", "3", "--out", "walks"), "walks"),
-        (("train", "--data", "walks"), "."),
+        (("steps", "collect", "--walks", "3", "--out", "walks"), "walks"),
+        (("steps", "train", "--data", "walks"), "."),
         (("verdict", "--out", "judged"), "judged"),
         (("propose", "reported"), "reported"),
     ],

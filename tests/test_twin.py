@@ -172,7 +172,7 @@ def walked(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         walker = ("walk", "--walker", OWN / "walker.py", *line, "--out", path)
         assert call(patch, *walker, "--robot", OWN / "twin.toml") == 0
-    return path, ("twin", path, *line, "--robot")
+    return path, ("log", "twin", path, *line, "--robot")
 
 
 def test_the_plans_of_the_example_are_those_of_its_twin(walked, monkeypatch, capsys):

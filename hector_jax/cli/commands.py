@@ -48,7 +48,7 @@ for _command in (
     walker.run_check,
     walker.run_twin,
     propose.run_propose,
-    propose.run_report,
+    propose.run_add,
     tune.run_tune,
     verdict.run_verdict,
     view.run_view,

@@ -60,12 +60,15 @@ Trajectories = tuple[Trajectory, ...]
 Run = Annotated[Path, PathKind.RUN]
 Folder = Annotated[Path, PathKind.FOLDER]
 
-COMMANDS: dict[str, type[Any]] = {}  # the flags of each command, by its name
+COMMANDS: dict[str, type[Any]] = {}  # the flags of each command, by its one or two words
+_GROUPS = {"log": ("check", "twin", "add"), "steps": ("collect", "train", "grfm")}
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
 def _command(kind: type[T]) -> type[T]:
-    COMMANDS[kind.__name__.lower()] = kind
+    name = kind.__name__.lower()
+    groups = [f"{group} " for group, names in _GROUPS.items() if name in names]
+    COMMANDS["".join([*groups, name])] = kind
     return dataclass(frozen=True)(kind)
 
 
@@ -130,7 +133,7 @@ class ByWalker(Flags):
 class Collect(Configured, ForRobot, Parallel):
     """Walk on the high-fidelity simulator and record the measured ground forces.
 
-    Example: hector collect --walks 128 --out data/more
+    Example: hector steps collect --walks 128 --out data/more
     """
 
     out: Folder = Path("data/walks")  # for the walks; its default names settings of your own
@@ -144,7 +147,7 @@ class Collect(Configured, ForRobot, Parallel):
 class Train(Configured, ForRobot, Printed):
     """Train GRFM-Net on collected walks.
 
-    Example: hector train --data data/more --out data/more.npz
+    Example: hector steps train --data data/more --out data/more.npz
     """
 
     data: Folder = Path("data/walks")  # folder of the walks
@@ -158,7 +161,7 @@ class Train(Configured, ForRobot, Printed):
 class Grfm(Configured, Parallel, Printed):
     """Report how well the nets predict the ground forces of walks that they never saw.
 
-    Example: hector grfm --seeds 0
+    Example: hector steps grfm --seeds 0
     """
 
     data: Folder = Path("data")  # folder of the walks and nets, which are made if they are missing
@@ -219,10 +222,10 @@ class Propose(ForRobot, Parallel, Printed):
 
 
 @_command
-class Report(Parallel, Printed):
+class Add(Parallel, Printed):
     """Take the logs of the walks with the weights that `hector propose` named.
 
-    Example: hector report runs/robot log.npz
+    Example: hector log add runs/robot log.npz
     """
 
     folder: Folder  # of `hector propose`
@@ -295,7 +298,7 @@ class Walk(Configured, ForRobot, ByWalker, Printed):
 class Check(ForRobot, Printed):
     """Say what in the log of a walk no weights can mend: mass, delay, joints, units and so on.
 
-    Example: hector check mine.npz --traj straight
+    Example: hector log check mine.npz --traj straight
     """
 
     log: Annotated[Path, PathKind.FILE]  # of any controller (docs/howto/own.md)
@@ -307,7 +310,7 @@ class Check(ForRobot, Printed):
 class Twin(Check):
     """Solve the plans of a log again, and say how far those of the robot's file are from them.
 
-    Example: hector twin mine.npz --robot mine.toml --traj straight --weights mine.json
+    Example: hector log twin mine.npz --robot mine.toml --traj straight --weights mine.json
     """
 
     weights: Weights = "nominal"  # with which the log was walked: a file, nominal, expert or best

@@ -10,7 +10,7 @@ import re
 import shlex
 from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout, suppress
-from dataclasses import MISSING, fields, replace
+from dataclasses import MISSING, fields, make_dataclass, replace
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
@@ -37,15 +37,15 @@ OVERVIEW = {
         "compare": "finished runs side by side",
     },
     "Tune on the walks of a robot, or of a simulator elsewhere": {
-        "check": "what of the log of a walk no weights can mend",
-        "twin": "how far the plans of a robot's file are from those of a log",
+        "log check": "what of the log of a walk no weights can mend",
+        "log twin": "how far the plans of a robot's file are from those of a log",
         "propose": "the weights to walk with next",
-        "report": "take the logs of these walks",
+        "log add": "take the logs of these walks",
     },
     "Single steps of a tuning": {
-        "collect": "walk on the simulator and record the ground forces",
-        "train": "train GRFM-Net, the model of the ground, on these walks",
-        "grfm": "how well that net predicts walks that it never saw",
+        "steps collect": "walk on the simulator and record the ground forces",
+        "steps train": "train GRFM-Net, the model of the ground, on these walks",
+        "steps grfm": "how well that net predicts walks that it never saw",
     },
     "This machine": {"doctor": "versions, devices, cache and video, with a test"},
 }
@@ -60,6 +60,7 @@ _HEAD = """hector tunes the weights of a walking robot's model predictive contro
 _EXIT_CODES = "Exit codes: 0 done, 1 something is broken, 2 bad input, 130 interrupted."
 _HELP = ("-h", "--help")
 _COMPLETION = "--tyro-print-completion"
+_TOPS = tuple(dict.fromkeys(name.split()[0] for name in COMMANDS if " " in name))
 _LATEST = Path("latest")  # stands for `latest_run`
 _NUMBERS: dict[Any, str] = {int: "a whole number", float: "a number"}
 
@@ -69,12 +70,15 @@ Flags = TypeVar("Flags")
 # The line
 
 
-def _command(word: str) -> type[Any]:
-    """Return the class of a command's flags, or raise InputError."""
-    if word not in COMMANDS:
-        hint = did_you_mean(word, COMMANDS) or f"; the commands are {', '.join(COMMANDS)}"
-        raise InputError(f"unknown command {short_repr(word)}{hint}")
-    return COMMANDS[word]
+def _command(words: Sequence[str]) -> str:
+    """Return the one or two words of the command with which a line begins, or raise InputError."""
+    word, two = words[0], " ".join(words[:2])
+    if word in COMMANDS or two in COMMANDS:
+        return word if word in COMMANDS else two
+    moved = {"report": "log add"} | {name.split()[-1]: name for name in COMMANDS if " " in name}
+    hint = f"; it is `hector {moved[word]}` now" if word in moved else did_you_mean(two, COMMANDS)
+    hint = hint or did_you_mean(word, COMMANDS) or f"; the commands are {', '.join(COMMANDS)}"
+    raise InputError(f"unknown command {short_repr(two if word in _TOPS else word)}{hint}")
 
 
 def from_line(words: Sequence[str]) -> Any:
@@ -88,13 +92,14 @@ def from_line(words: Sequence[str]) -> Any:
             wrong type.
     """
     helps = [word for word in words if word in _HELP]
-    name, *rest = [word for word in words if word not in _HELP] or [""]
-    if name == _COMPLETION:
+    rest = [word for word in words if word not in _HELP]
+    if rest[:1] == [_COMPLETION]:
         return _all_commands(words)
-    if not name:
-        print(overview())
+    if not rest or (len(rest) == 1 and rest[0] in _TOPS):
+        print(overview(*rest))
         raise SystemExit(0)
-    return read_flags(_command(name), [*rest, *helps], f"hector {name}")
+    name = _command(rest)
+    return read_flags(COMMANDS[name], [*rest[name.count(" ") + 1 :], *helps], f"hector {name}")
 
 
 def read_flags(kind: type[Flags], words: Sequence[str], program: str) -> Flags:
@@ -116,19 +121,30 @@ def read_flags(kind: type[Flags], words: Sequence[str], program: str) -> Flags:
     return with_given(_quietly(kind, words, **options), (x.replace("-", "_") for x in given))
 
 
-def overview() -> str:
-    """Return the text of `hector --help`."""
-    lines = [_HEAD]
+def overview(top: str = "") -> str:
+    """Return the text of `hector --help`, or of the commands of two words that begin with one."""
+    lines = [] if top else [_HEAD]
     for heading, commands in OVERVIEW.items():
-        rows = [f"  {name:<10s}{text}" for name, text in commands.items()]
-        lines += [f"{heading}:", *rows, ""]
+        rows = [f"  {name:<14s}{text}" for name, text in commands.items() if name.startswith(top)]
+        lines += [f"{heading}:", *rows, ""] if rows else []
     return "\n".join([*lines, _EXIT_CODES])
 
 
 def _all_commands(words: Sequence[str]) -> Any:
     """Run tyro's own flags on all commands; exits by SystemExit."""
-    kinds = [Annotated[kind, tyro.conf.subcommand(name)] for name, kind in COMMANDS.items()]
-    return _tyro(Union[tuple(kinds)], words, prog="hector")  # noqa: UP007
+
+    def union(prefix: str) -> Any:
+        kinds = [
+            Annotated[kind, tyro.conf.subcommand(name.removeprefix(prefix))]
+            for name, kind in COMMANDS.items()
+            if name.startswith(prefix) and " " not in name.removeprefix(prefix)
+        ]
+        tops = () if prefix else _TOPS
+        groups = (make_dataclass(top.title(), [("command", union(f"{top} "))]) for top in tops)
+        named = (Annotated[group, tyro.conf.subcommand(group.__name__.lower())] for group in groups)
+        return Union[(*kinds, *named)]  # noqa: UP007
+
+    return _tyro(union(""), words, prog="hector")
 
 
 def _quietly(kind: type, words: Sequence[str], **options: Any) -> Any:

@@ -1,4 +1,4 @@
-"""`hector propose` and `hector report`: tune on walks of a real robot or another simulator."""
+"""`hector propose` and `hector log add`: tune on walks of a real robot or another simulator."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -10,7 +10,7 @@ import numpy as np
 
 from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.arguments import print_result
-from hector_jax.cli.flags import Propose, Report, named_file
+from hector_jax.cli.flags import Add, Propose, named_file
 from hector_jax.cli.parse import as_table, from_file
 from hector_jax.control.parameters import tunables
 from hector_jax.control.weights_file import load_weights
@@ -47,12 +47,12 @@ def run_propose(args: Propose) -> None:
         print(f"walk {number}{again}: {weights}")
         print(f"to be walked on {names} for {campaign.seconds:g} s each; then:")
         logs = " ".join(f"{name}.npz" for name in campaign.commands)
-        print(f"hector report {args.folder} {logs}")
+        print(f"hector log add {args.folder} {logs}")
 
     print_result(args.json, result, print_text)
 
 
-def run_report(args: Report) -> None:
+def run_add(args: Add) -> None:
     """Read the logs of the walks with the proposed weights and evaluate them, or undo that."""
     path = args.folder / CONFIG
     if not path.exists():
@@ -88,7 +88,7 @@ def run_report(args: Report) -> None:
     print_result(args.json, result | {"logs": tracked}, print_text)
 
 
-def _undo(args: Report, campaign: Campaign) -> None:
+def _undo(args: Add, campaign: Campaign) -> None:
     with locked(args.folder):
         number, paths = reported_walks.undo_report(campaign)
     weights, logs = str(walks.weights_path(args.folder, number)), [str(path) for path in paths]

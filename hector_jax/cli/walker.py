@@ -83,7 +83,7 @@ def _parity_result(parity: Parity) -> dict[str, Any]:
 
 
 def _parity_lines(result: Mapping[str, Any], robot: Robot) -> Iterator[str]:
-    """Return the lines that `hector twin` prints of its result."""
+    """Return the lines that `hector log twin` prints of its result."""
     yield f"{plural(result['plans'], 'plan')}; differences in N and N m, world frame"
     yield f"{'':5}" + "".join(f"{name:>10}" for name in result["differences"]["F_x"])
     for name, row in result["differences"].items():
