@@ -23,7 +23,8 @@ from hector_jax.grfm.training import TrainConfig
 from hector_jax.store import nets
 from hector_jax.store.nets import CollectConfig
 
-SHORT = 'name = "{}"\n[[segment]]\nseconds = 0.2\nv_x = {}\n'
+SHORT = 'name = "{}"\n[[segment]]\nseconds = {}\nv_x = {}\n'
+LENGTHS = {"short": 0.2, "long": 1.5}  # a log of a walker is checked, which takes 1.5 s
 SPEEDS = {"straight": 0.3, "c": 0.25, "s": 0.2, "slalom": 0.15}
 SMALL = {
     "tune": "--iterations 1 --seeds 1 --no-video --walk-plants 1",
@@ -59,17 +60,18 @@ def words_of(line):
     if command == "tune" and not {"--traj", "--resume", "--config"} & {*words}:
         words += ["--traj", "straight"]
     files = command not in SECONDS or "runs/robot" in line  # that `hector propose` was given
-    words = [one for word in words for one in found(word, files)]
+    long = "--walker" in words
+    words = [one for word in words for one in found(word, files, "long" if long else "short")]
     if command in SECONDS and "--seconds" not in words and "short/" not in " ".join(words):
-        small += ["--seconds", str(SECONDS[command])]
+        small += ["--seconds", str(LENGTHS["long"] if long else SECONDS[command])]
     return [*top, command, *words, *small]
 
 
-def found(word, files):
-    """The words that stand for one: short trajectories, files that there are, the last run."""
+def found(word, files, length):
+    """The words that stand for one: trajectories of a length, files, the last run."""
     name = Path(word).stem
     if word == "examples/slalom.toml" or (files and word in SPEEDS):
-        return [f"short/{name}.toml"]
+        return [f"{length}/{name}.toml"]
     if "TIME" in word:
         return [word.replace("runs/c/TIME", str(max(Path("runs/short-c").iterdir())))]
     if "*" in word:
@@ -109,15 +111,17 @@ PAIRS = [
     "hector tune --resume runs/own",
 ]
 """Lines of flags that meet in the code, in an order in which each has its input."""
+PROPOSED = "hector propose runs/robot --traj s"
+PROPOSED_WALK = "hector walk --weights runs/robot/weights/0.json --traj s --out {}"
 INPUTS = {
-    "hector log add runs/robot log.npz": "hector walk --weights runs/robot/weights/0.json --traj s "
-    "--out log.npz",
-    "hector log add runs/robot s.npz": "hector walk --weights runs/robot/weights/0.json --traj s "
-    "--out s.npz",
-    "hector log check mine.npz --traj straight": "hector walk --traj straight --seconds 1.5 "
-    "--out mine.npz",
-    "hector evaluate --walker mine.py --robot mine.toml --traj c --weights mine.json best.json": ""
-    "hector walk --walker mine.py --robot mine.toml --out log.npz",
+    "hector log add runs/robot log.npz": [PROPOSED, PROPOSED_WALK.format("log.npz")],
+    "hector log add runs/robot s.npz": [PROPOSED, PROPOSED_WALK.format("s.npz")],
+    "hector log check mine.npz --traj straight": [
+        "hector walk --traj straight --seconds 1.5 --out mine.npz"
+    ],
+    "hector evaluate --walker mine.py --robot mine.toml --traj c --weights mine.json best.json": [
+        "hector walk --walker mine.py --robot mine.toml --out log.npz"
+    ],
 }
 """Lines whose input another page tells how to make, in words."""
 
@@ -152,9 +156,11 @@ def console(tmp_path_factory):
             patch.setattr(module, "workers", lambda *_: nullcontext(pool))
         for folder in ("assets", "examples"):
             Path(folder).symlink_to(ROOT / folder)
-        Path("short").mkdir()
-        for name, speed in SPEEDS.items():
-            Path(f"short/{name}.toml").write_text(SHORT.format(f"short-{name}", speed))
+        for length, seconds in LENGTHS.items():
+            Path(length).mkdir()
+            for name, speed in SPEEDS.items():
+                text = SHORT.format(f"{length}-{name}", seconds, speed)
+                Path(f"{length}/{name}.toml").write_text(text)
         Path("mine.py").symlink_to(own / "walker.py")
         Path("hector.xml").symlink_to(own / "hector.xml")
         for name in ("mine", "twin"):
@@ -170,11 +176,10 @@ def test_a_documented_line_runs_to_its_end(console, capsys, line):
     for engine in ("drake", "pinocchio"):
         if engine in line:
             pytest.importorskip("pydrake" if engine == "drake" else engine)
-    if "propose" in line and "--traj" in line:
-        shutil.rmtree("runs/robot", ignore_errors=True)  # another reader begins anew
-    if line in INPUTS:
-        assert console(INPUTS[line]) == 0
-    code = console(line)
+    for one in (*INPUTS.get(line, ()), line):
+        if "propose" in one and "--traj" in one:
+            shutil.rmtree("runs/robot", ignore_errors=True)  # another reader begins anew
+        code = console(one)
     out, err = capsys.readouterr()
     assert code == 0, err
     assert "Traceback" not in out + err
