@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -69,12 +70,24 @@ def test_an_unknown_command_is_told_with_the_nearest(monkeypatch, capsys, line, 
 def test_every_help_tells_each_flag_and_gives_an_example(monkeypatch, capsys, name):
     monkeypatch.setenv("COLUMNS", "200")
     with pytest.raises(SystemExit) as left:
-        call(monkeypatch, *name.split(), "--help")
+        call(monkeypatch, *name.split(), "--help-all")
     assert left.value.code == 0
     shown = capsys.readouterr().out
     assert f"Example: hector {name}" in shown
     assert "None" not in shown
     assert not re.search(r"^.*--[\w-]+( \S+)?  +\(default", shown, re.MULTILINE)
+
+
+def test_the_help_of_tune_fits_on_a_screen_and_says_where_the_rest_is(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit) as left:
+        call(monkeypatch, "tune", "--help")
+    assert left.value.code == 0
+    lines = capsys.readouterr().out.splitlines()
+    told = [flag[1] for line in lines if (flag := re.match(r"  --([\w-]+)", line))]
+    assert sorted(told) == sorted(Tune.usual)
+    assert lines[-1] == f"{len(fields(Tune)) - len(told)} more flags: hector tune --help-all"
+    assert len(lines) <= 40
 
 
 def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, capsys):

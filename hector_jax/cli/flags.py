@@ -78,6 +78,7 @@ class Flags:
 
     # names of those that the line or its file gave; others have their default
     given: ClassVar[frozenset[str]] = frozenset()
+    usual: ClassVar[frozenset[str]] = frozenset()  # all that --help tells; none: it tells each
 
     def is_given(self, name: str) -> bool:
         """Tell whether a flag was given: on the line, in a file, or in Python by another value."""
@@ -176,6 +177,7 @@ class Tune(Configured, ByWalker, Parallel):
     Example: hector tune --traj straight c s --seeds 32
     """
 
+    usual = frozenset("traj start tune seeds smooth safe walks robot walker out resume".split())
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
     each: bool = False  # tune the trajectories one by one, each in a run folder of its own
     start: Weights = "nominal"  # where to start: nominal, expert, best or a weights file

@@ -58,7 +58,8 @@ _HEAD = """hector tunes the weights of a walking robot's model predictive contro
     hector COMMAND --help           # flags of a command, with an example
 """
 _EXIT_CODES = "Exit codes: 0 done, 1 something is broken, 2 bad input, 130 interrupted."
-_HELP = ("-h", "--help")
+_ALL = "--help-all"
+_HELP = ("-h", "--help", _ALL)
 _COMPLETION = "--tyro-print-completion"
 _TOPS = tuple(dict.fromkeys(name.split()[0] for name in COMMANDS if " " in name))
 _LATEST = Path("latest")  # stands for `latest_run`
@@ -104,7 +105,7 @@ def from_line(words: Sequence[str]) -> Any:
 
 def read_flags(kind: type[Flags], words: Sequence[str], program: str) -> Flags:
     """Read the flags of a program from the words after its name; see `from_line`."""
-    wants_help = any(word in _HELP for word in words)
+    helps = [word for word in words if word in _HELP]
     options: dict[str, Any] = {"prog": program}
     words = [word for word in words if word not in _HELP]
     names = [word[2:].partition("=")[0].replace("_", "-") for word in words if word[:2] == "--"]
@@ -116,9 +117,25 @@ def read_flags(kind: type[Flags], words: Sequence[str], program: str) -> Flags:
         flags_of_line: Any = _quietly(kind, words, **options)
         options["default"] = default = from_file(kind, flags_of_line.config)
         given += getattr(default, "given", ())
-    if wants_help:
-        return _tyro(kind, ["--help"], **options)
+    if helps:
+        return _print_help(kind, _ALL in helps, **options)
     return with_given(_quietly(kind, words, **options), (x.replace("-", "_") for x in given))
+
+
+def _print_help(kind: Any, whole: bool, **options: Any) -> Any:
+    """Print the help of a command, of its usual flags or of all; exits by SystemExit."""
+    if whole or not kind.usual:
+        return _tyro(kind, ["--help"], **options)
+    text, shown = io.StringIO(), True
+    with redirect_stdout(text), suppress(SystemExit):
+        _tyro(kind, ["--help"], **options)
+    for line in text.getvalue().splitlines():
+        if flag := re.match(r"  --(\w[\w-]*)", line):  # what follows belongs to it
+            shown = flag[1] in kind.usual
+        if shown and line.strip():
+            print(line.rstrip())
+    print(f"{len(fields(kind)) - len(kind.usual)} more flags: {options['prog']} {_ALL}")
+    raise SystemExit(0)
 
 
 def overview(top: str = "") -> str:
