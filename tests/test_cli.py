@@ -110,8 +110,8 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
     [
         ("walk --weights exprt", "'exprt'; did you mean 'expert'?"),
         ("tune --traj circle", "straight, c, s"),
-        ("collect --seconds 0.001", "at least 0.03 s, the 3 ticks of one sample, got 0.001"),
-        ("collect --walks 2", "--walks must be a whole number from 3 to"),
+        ("steps collect --seconds 0.001", "at least 0.03 s, the 3 ticks of one sample, got 0.001"),
+        ("steps collect --walks 2", "--walks must be a whole number from 3 to"),
     ],
 )
 def test_wrong_input_is_one_line_before_anything_is_computed(

@@ -145,7 +145,7 @@ This run: 1e5, 2e5, 0.623.
 | touchdown, sideways [cm^2] | 4 | 4 | 4 |
 [Before and after.](film.mp4)
 Each weight set walked 4 times (all trajectories, on each plant)
-`best` is set 1, the last accepted one that falls in no more walks than the start
+`best` is set 1, the last accepted one or set 0
 ; it ended because: 4 iterations.
 | 0 | +0.0 | 0 | accepted |
 | 1 | -10.0 | 0 | accepted |

@@ -18,7 +18,7 @@ from pretend import instead
 from test_walks import HandsOver, same, same_sets
 
 from hector_jax.cli import evaluate, propose
-from hector_jax.cli.flags import Propose, Report, Walk
+from hector_jax.cli.flags import Add, Propose, Walk
 from hector_jax.control.trajectories import load_command
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights
@@ -111,7 +111,7 @@ def carded(folder, name, path=None, *, weights=None, number=0, card=None, **opti
 
 
 def report(folder, *logs, **flags):
-    propose.run_report(Report(folder, logs, json=True, **flags))
+    propose.run_add(Add(folder, logs, json=True, **flags))
 
 
 def content(folder):
@@ -389,7 +389,7 @@ def test_the_best_set_is_called_clear_by_walks_that_did_not_choose_it(folder, en
         assert found["again"]["change"] == pytest.approx(100.0 * np.expm1(mean))
         assert found["again"]["clear"] is True
         assert found["change"] == found["again"]["change"]
-    propose.run_report(Report(folder, (plain("ahead", "last.npz", error=0.0103),)))
+    propose.run_add(Add(folder, (plain("ahead", "last.npz", error=0.0103),)))
     text = capsys.readouterr().out
     assert "best is walk 2, L -" in text
     assert "in walks that did not choose it\n" in text
@@ -400,7 +400,7 @@ def test_a_gain_that_only_the_walk_that_chose_the_set_shows_is_not_called_clear(
     folder, ended, capsys
 ):
     ended(0.02, 0.015, 0.01)
-    propose.run_report(Report(folder, (plain("ahead", "last.npz", error=0.0195),)))
+    propose.run_add(Add(folder, (plain("ahead", "last.npz", error=0.0195),)))
     text = capsys.readouterr().out
     assert "in walks that did not choose it: not distinguishable from the start" in text
     assert read(folder).again.clear is False
@@ -424,7 +424,7 @@ def test_a_walk_of_the_best_set_is_undone_and_the_same_set_waits(folder, ended, 
 
 def test_a_fall_of_the_best_set_is_no_change_of_the_loss(folder, ended, capsys):
     ended(0.02, 0.015, 0.01)
-    propose.run_report(Report(folder, (plain("ahead", "last.npz", fall_at=0.04),)))
+    propose.run_add(Add(folder, (plain("ahead", "last.npz", fall_at=0.04),)))
     assert "walk 3: fell; best is walk 2, fell, in walks that did not" in capsys.readouterr().out
     assert read(folder).again == (None, False)
 

@@ -367,19 +367,25 @@ def test_a_fall_is_a_bounded_loss_of_its_case_and_has_no_slope(toy):
     one, at = toy(cases=3), nominal()
     start = np.array([toy_loss(at, case) for case in range(3)])
     objective = walks._Walks(
-        Here(), one, partial(asked, cases=3, fell=lambda n, case, _: (n, case) == (1, 1))
+        Here(), one, partial(asked, cases=3, fell=lambda n, case, _: case == 1)
     )
-    assert float(objective.slope(at)[0].loss) == pytest.approx(np.exp(np.log(start).mean()))
+    worst = np.e * max(start[0], start[2])
+    of_start = np.exp(np.mean(np.log([start[0], worst, start[2]])))
+    assert float(objective.slope(at)[0].loss) == pytest.approx(of_start)
     objective.ask = lambda number, weights: [
         walk_log.ScoredLog(x, LOG) for x in (start[0], np.inf, 1e3 * start[2])
     ]
-    (found, _), worst = objective.slope(at), np.e * start[2]
+    found, _ = objective.slope(at)
     value = np.exp(np.mean(np.log([start[0], worst, worst])))
     assert float(found.loss) == pytest.approx(value)
     slopes = [np.asarray(weights_to_vector(toy_slope(one, at, c, LOG)[0].gradient)) for c in (0, 2)]
     expected = value / 3.0 * sum(g / start[c] for g, c in zip(slopes, (0, 2), strict=True))
     np.testing.assert_allclose(weights_to_vector(found.gradient), expected, rtol=1e-12)
-    assert float(found.fallen) == 1.0  # it falls in more cases than the start
+    assert float(found.fallen) == 0.0
+    objective.ask = lambda number, weights: [
+        walk_log.ScoredLog(x, LOG) for x in (np.inf, np.inf, start[2])
+    ]
+    assert float(objective.slope(at)[0].fallen) == 1.0  # it falls in more cases than the start
 
 
 def test_a_set_that_falls_in_more_cases_than_the_start_is_refused(toy):

@@ -182,7 +182,7 @@ class Tune(Configured, ByWalker, Parallel):
     each: bool = False  # tune the trajectories one by one, each in a run folder of its own
     start: Weights = "nominal"  # where to start: nominal, expert, best or a weights file
     # weights: Q and R; also footsteps, integral, all, or numbers by name;
-    # `best` has the gains of the integral action in any case
+    # `best` has the gains of the integral action and turn_lead in any case
     tune: tuple[Tunables, ...] = ("weights",)
     seeds: Plants = 8  # stand-in plants to evaluate on
     iterations: Annotated[int, Range(1, 10_000)] = 10  # largest number of steps of each tuning
@@ -202,7 +202,7 @@ class Tune(Configured, ByWalker, Parallel):
     # walks to spend on row `best` after the choice of its start; 0 for none; by default four sets
     # walk on twelve drawn plants (docs/howto/walks.md)
     walks: Annotated[int | None, Range(0, 100_000)] = None
-    # drawn plants of these walks, 0 for the simulator; by default so that eight sets can walk
+    # drawn plants of these walks, 0 for the simulator; by default twelve, or as --walks allows
     walk_plants: Annotated[int | None, Range(0, 1000)] = None
     walk_engine: WalkEngine = "c"  # of these walks; c: MuJoCo; extras: drake, pinocchio
     json: bool = False  # print JSON instead of the table; `run` is the folder

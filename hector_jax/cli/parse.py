@@ -131,7 +131,7 @@ def _print_help(kind: Any, whole: bool, **options: Any) -> Any:
         _tyro(kind, ["--help"], **options)
     for line in text.getvalue().splitlines():
         if flag := re.match(r"  --(\w[\w-]*)", line):  # what follows belongs to it
-            shown = flag[1] in kind.usual
+            shown = flag[1].replace("-", "_") in kind.usual
         if shown and line.strip():
             print(line.rstrip())
     print(f"{len(fields(kind)) - len(kind.usual)} more flags: {options['prog']} {_ALL}")
@@ -175,7 +175,8 @@ def _quietly(kind: type, words: Sequence[str], **options: Any) -> Any:
         raise InputError(one_line(body[0] if body else title)) from None
     if not rest:
         return flags
-    name, help_line = options["prog"].split()[-1], f"; see {options['prog']} --help"
+    name = options["prog"].removeprefix("hector ")
+    help_line = f"; see {options['prog']} {_ALL if kind.usual else '--help'}"
     if not rest[0].startswith("--"):
         raise InputError(f"{name} does not expect {short_repr(rest[0])}{help_line}")
     flag = rest[0].partition("=")[0]

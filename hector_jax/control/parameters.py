@@ -259,7 +259,10 @@ def gradient_by_steps(
 def gradient_by_weights(
     weights: Weights, gradient: Float[Array, " n"], others: Sequence[str] = ()
 ) -> Weights:
-    """Return the gradient by the weights, all feet alike, of one by steps: `gradient_by_steps`."""
+    """Return the gradient by the weights of which `gradient_by_steps` is this one.
+
+    Feet have equal shares; numbers that are not stepped have zero.
+    """
     none = jnp.zeros_like(gradient)
 
     def change(steps: Float[Array, " n"]) -> Weights:

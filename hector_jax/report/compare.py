@@ -105,7 +105,7 @@ def print_comparison(comparison: Mapping[str, Any], console: Console | None = No
             if name != "commit":
                 add(f"{kind}: {name}", values)
     console.print(table)
-    if "flags.alpha" in differ["settings"] or any("loss" in x for x in differ["settings"]):
+    if any(name.startswith("tune.loss") for name in differ["settings"]):
         console.print("The losses differ (see the settings), so that their L cannot be compared.")
     if len(runs) > 1 and not any(differ.values()):
         console.print("All settings and versions are the same.")

@@ -44,20 +44,10 @@ def write_run_report(folder: Path, **contents: Any) -> Path:
     return folder / "report.md"
 
 
-def tuning_section(
-    name: str,
-    tuning: Tuning,
-    where: str = "on the model",
-) -> str:
-    """Return the section of a tuning.
-
-    Args:
-        name: of the set.
-        tuning: with its history.
-        where: the loss was computed, in words.
-    """
-    values = {"name": name, "tuning": tuning, "where": where}
-    return render("tuning.md.j2", **values, refusals=_refusals, at_bounds=_at_bounds)
+def tuning_section(name: str, tuning: Tuning) -> str:
+    """Return the section of a tuning, by the name of its set."""
+    values = {"name": name, "tuning": tuning, "refusals": _refusals, "at_bounds": _at_bounds}
+    return render("tuning.md.j2", **values)
 
 
 def _refusals(refused: Sequence[Iteration]) -> list[str]:

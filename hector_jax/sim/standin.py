@@ -1,6 +1,6 @@
 """The stand-in for hardware: families of plants, one plant per seed, for verdicts only.
 
-No collection, training, tuning, search or choice reads this module; tests/test_architecture.py
+No collection, training or tuning reads this module; tests/test_architecture.py
 checks that. The plants differ from the hfs in strength and in kind (masses, ground, an estimator
 with noise and drift), so that a map learned on the hfs is not tested on its own simulator. Seeds
 0-31 are for development; published verdicts walked others, which their files name.

@@ -246,7 +246,8 @@ def loss_curves(histories: Histories) -> dict[str, Float[np.ndarray, " n"]]:
 def progress_sentence(histories: Histories, done: bool) -> str:
     """Describe the progress of the tunings."""
     newest = [
-        f"{name}: iteration {last.iteration}, L {last.evaluation.loss / 1e6:.3f}e6"
-        for name, last in _newest(histories).items()
+        f"{name}: iteration {at.iteration}, loss {at.evaluation.loss / whole:.0f} % of the start"
+        for name, at in _newest(histories).items()
+        for whole in [histories[name][0].evaluation.loss / 100.0]
     ]
     return "; ".join([*newest, "the run is done" if done else "the run goes on"])

@@ -1,7 +1,7 @@
 """The set `best`: the settings of its tuning, and the plants on whose walks it is tuned further.
 
-The rigid-body model is inexact: a tuning can gain on the model and lose on the robot. So the result
-of a tuning on drawn variations of the model is tuned on, with the walks of drawn plants.
+The rigid-body model is inexact: a tuning can gain on the model and lose on the robot. So what
+the tunings on the model have found is tuned on, with the walks of drawn plants.
 """
 
 from dataclasses import replace

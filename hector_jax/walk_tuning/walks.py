@@ -58,7 +58,7 @@ from hector_jax.walk_tuning.walk_log import (
 )
 
 RECORD = "walks.jsonl"
-CHOICE_PLANTS = 3  # on which several starts walk
+START_PLANTS = 3  # on which several starts walk
 _FALL = 1.0  # log L of a fall above the largest of the start
 
 
@@ -140,7 +140,7 @@ def _slope(
 
 
 def first_slope(campaign: Campaign) -> None:
-    """Walk the start in the first case, so that the programs of the others are in the cache."""
+    """Compile the programs of the tuning, of which this walk is none, into the cache."""
     _slope(campaign, campaign.start, 0, walk_case(campaign, campaign.start, 0).log)
 
 
@@ -148,13 +148,13 @@ def from_best_of(pool: Executor, campaign: Campaign, starts: Mapping[str, Weight
     """Return the campaign from that of several starts which walks best.
 
     Each walks on the first plants; of those that fall least often it is that with the least mean of
-    log L. Its walks are not made again.
+    log L, a fall bounded as in the tuning. Its walks are not made again.
 
     Args:
         pool, campaign: as for `tune_on_walks`; its own start does not matter.
         starts: weights by name.
     """
-    tried, rows, few = [], [], campaign.plants[:CHOICE_PLANTS]
+    tried, rows, few = [], [], campaign.plants[:START_PLANTS]
     with bar("walking with each set that the tuning on walks may begin with") as report_progress:
         for name, start in starts.items():
             report_progress(len(tried), len(starts), name)
@@ -164,9 +164,9 @@ def from_best_of(pool: Executor, campaign: Campaign, starts: Mapping[str, Weight
             save_weights(weights_path(folder, 0), one.start)
             rows.append([walked.loss for walked in walk_all(pool, one, 0, one.start)])
             tried.append(one)
-    stood = np.isfinite(losses := np.array(rows))
-    sums = np.log(losses, where=stood, out=np.zeros_like(losses)).sum(axis=1)
-    best = tried[np.lexsort((sums, -stood.sum(axis=1)))[0]]
+    losses = np.array(rows)
+    means = _bounded_logs(losses, losses).mean(axis=1)
+    best = tried[np.lexsort((means, (~np.isfinite(losses)).sum(axis=1)))[0]]
     say(f"it begins with `{best.folder.name}`")
     for path, kept in zip(log_paths(best, 0), log_paths(campaign, 0), strict=False):
         write_file(kept, path.read_bytes())
@@ -174,6 +174,14 @@ def from_best_of(pool: Executor, campaign: Campaign, starts: Mapping[str, Weight
 
 
 # The objective
+
+
+def _bounded_logs(
+    losses: Float[np.ndarray, "*cases"], known: Float[np.ndarray, "*others"]
+) -> Float[np.ndarray, "*cases"]:
+    """Return log L, that of a fall and of what is worse a bound above the largest known one."""
+    worst = np.exp(_FALL) * known[np.isfinite(known)].max(initial=1.0)
+    return np.log(np.where(np.isfinite(losses), np.minimum(losses, worst), worst))
 
 
 class _Walks:
@@ -206,10 +214,9 @@ class _Walks:
         losses = np.array([walked.loss for walked in logs])
         stood = np.isfinite(losses)
         self.losses.append(losses)
-        start = self.losses[0][np.isfinite(self.losses[0])]
-        worst = np.exp(_FALL) * start.max(initial=1.0)
-        value = float(np.exp(np.mean(np.log(np.where(stood, np.minimum(losses, worst), worst)))))
-        on = np.flatnonzero(stood).tolist()
+        value = float(np.exp(_bounded_logs(losses, self.losses[0]).mean()))
+        refused = stood.sum() < np.isfinite(self.losses[0]).sum()
+        on = [] if refused else np.flatnonzero(stood).tolist()  # a slope takes as long as a walk
         some = [logs[case].log for case in on]
         slopes = self.pool.map(_slope, repeat(campaign), repeat(weights), on, some)
         usable = [x for x in slopes if step_status(campaign.config, x[0]) == StepStatus.ACCEPTED]
@@ -220,12 +227,11 @@ class _Walks:
 
         numbers = len(parameters.step_names(weights, campaign.config.others))
         gradient, matrix = jax.tree.map(np.zeros_like, weights), np.zeros((numbers, numbers))
-        residual, falls = 0.0, [int(np.isinf(each).sum()) for each in self.losses]
+        residual, fallen = 0.0, float(not usable)
         if usable:
-            gradient, matrix = mean([(found.gradient, matrix) for found, matrix in usable])
+            gradient, matrix = mean([(found.gradient, curved) for found, curved in usable])
             residual = np.max([found.residual for found, _ in usable])
-        fallen = np.asarray(float(falls[-1] > falls[0] or not usable))
-        checks = fallen, np.asarray(residual)
+        checks = np.asarray(fallen), np.asarray(residual)
         return Evaluation(np.asarray(value), {}, gradient, *checks), matrix
 
 
@@ -269,8 +275,8 @@ def tune_on_walks(
 
         report_progress(0, config.iterations + 1, "compiling")
         try:
-            parts = Objective(objective.slope, objective.place)
-            tuning = difftune.descend(config, campaign.start, parts, on_iteration)
+            loss = Objective(objective.slope, objective.place)
+            tuning = difftune.descend(config, campaign.start, loss, on_iteration)
         except Waiting:
             write_record()  # without sets whose report was undone
             waiting = load_weights(weights_path(campaign.folder, len(sets)), campaign.robot)

@@ -27,9 +27,6 @@ SETS = {
     "without": {"color": ORANGE, "linestyle": (0, (4, 1.2, 1, 1.2))},
     "with": {"color": GREEN, "linestyle": "-"},
     "best": {"color": "#1f2f8f", "linestyle": "-"},
-    "shared_mean": {"color": "#b0186a", "linestyle": (0, (8, 1.5))},
-    "shared_worst": {"color": "#d670a5", "linestyle": (0, (8, 1.5, 1, 1.5, 1, 1.5))},
-    "search_2000": {"color": "#5c3a1e", "linestyle": (0, (8, 1.5, 1, 1.5))},
 }
 """Lines of the package's weight sets; `looks_of` returns a look for any set."""
 
@@ -46,7 +43,6 @@ CURVES = {
 CURVES |= {"raw": CURVES["commanded"], "residual": SETS["with"]}
 
 _MARKER = {"nominal": "v", "expert": "D", "without": "s", "with": "o", "best": "p"}
-_MARKER |= {"search_2000": "*", "shared_mean": "<", "shared_worst": ">"}
 _SPARE_STYLE = {"linestyle": (0, (2.5, 1, 1, 1, 1, 1)), "linewidth": 1.1}
 _SPARE = (("#b8447a", "s"), ("#6cb0dc", "^"), ("#8a8a00", "h"), ("black", "P"), ("#c07a3a", "X"))
 _NAMES = {
