@@ -37,12 +37,7 @@ from hector_jax.store.folder import as_row
 from hector_jax.store.setup import Setup
 from hector_jax.tuning import batch, difftune
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning, step_status
-from hector_jax.tuning.evaluate import (
-    Evaluation,
-    Objective,
-    gradient_norms,
-    mean_objective,
-)
+from hector_jax.tuning.evaluate import Evaluation, Objective, gradient_norms, mean_objective
 from hector_jax.tuning.loss import Loss, loss_of_robot
 from hector_jax.tuning.rollout import Scenario, rollout_config
 from hector_jax.tuning.status import StepStatus

@@ -22,13 +22,7 @@ from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.trajectory import Disturbance, State, Trajectory, Wrench, has_fallen
 from hector_jax.robot.model import Robot
-from hector_jax.tuning.rollout import (
-    Carry,
-    RolloutConfig,
-    Scenario,
-    command_history,
-    step_carry,
-)
+from hector_jax.tuning.rollout import Carry, RolloutConfig, Scenario, command_history, step_carry
 
 
 class MeasuredState(NamedTuple):

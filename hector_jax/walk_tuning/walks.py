@@ -49,13 +49,7 @@ from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
 from hector_jax.tuning.rollout import Scenario
 from hector_jax.tuning.status import StepStatus
 from hector_jax.walk_tuning.campaign import Campaign, walker_hash
-from hector_jax.walk_tuning.walk_log import (
-    Log,
-    ScoredLog,
-    evaluate_log,
-    log_of,
-    trajectory_of,
-)
+from hector_jax.walk_tuning.walk_log import Log, ScoredLog, evaluate_log, log_of, trajectory_of
 
 RECORD = "walks.jsonl"
 START_PLANTS = 3  # on which several starts walk
