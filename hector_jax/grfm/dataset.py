@@ -114,9 +114,7 @@ def make_dataset(
     count = len(walks.fallen)
     starts = np.broadcast_to(np.asarray(start_tick, np.int32), (count,))
     pushes = jax.tree.map(
-        lambda x, no_push: np.broadcast_to(x, (count, *np.shape(x)[-no_push.ndim :])),
-        push,
-        NO_PUSH,
+        lambda x, no_push: np.broadcast_to(x, (count, *np.shape(x)[-no_push.ndim :])), push, NO_PUSH
     )
     each = np.arange(count), starts, pushes, walks
     samples, usable = _all_samples(config, robot, each)
@@ -130,9 +128,7 @@ def _all_samples(config: WalkConfig, robot: Robot, each: tuple) -> tuple[Dataset
 
 
 def _samples(
-    config: WalkConfig,
-    robot: Robot,
-    one: tuple[Int[Array, ""], Int[Array, ""], Push, Trajectory],
+    config: WalkConfig, robot: Robot, one: tuple[Int[Array, ""], Int[Array, ""], Push, Trajectory]
 ) -> tuple[Dataset, Bool[Array, " n"]]:
     """Return the samples of a walk and whether each is usable.
 

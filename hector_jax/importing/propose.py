@@ -219,12 +219,7 @@ def _settings(robot: Robot) -> dict[str, Any]:
         },
         "weights": _weights(mass, size),
         "loss": {"L_ctrl": _short(mass**-2)},
-        "tuning": {
-            "lead": 2 * ticks,
-            "touchdown_error": True,
-            "estimate_noise": 1,
-            "delay": 0.005,
-        },
+        "tuning": {"lead": 2 * ticks, "touchdown_error": True, "estimate_noise": 1, "delay": 0.005},
         "plants": {
             "joint_friction": torque,
             "joint_damping": torque,

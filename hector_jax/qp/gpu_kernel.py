@@ -248,10 +248,7 @@ def _products(
 
 
 def _kernel(
-    shape: tuple[int, ...],
-    curvature: float,
-    barrier: Callable[[], Any],
-    *refs: Any,
+    shape: tuple[int, ...], curvature: float, barrier: Callable[[], Any], *refs: Any
 ) -> None:
     P_ref, q_ref, A_ref, lower_ref, upper_ref, *out_refs = refs
     out: Any = Guess(*out_refs)

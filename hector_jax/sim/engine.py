@@ -86,11 +86,7 @@ def _optional_engine(name: str, title: str, plant: str, package: str, differs: s
 
 
 DRAKE = _optional_engine(
-    "drake",
-    "Drake",
-    "DrakePlant",
-    package="drake",
-    differs="dry friction is smooth",
+    "drake", "Drake", "DrakePlant", package="drake", differs="dry friction is smooth"
 )
 """Drake: compliant contact, solved as a convex problem."""
 

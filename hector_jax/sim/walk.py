@@ -163,11 +163,7 @@ def _parameters(config: WalkConfig, weights: Weights) -> Parameters:
 
 @quiet_mujoco()
 def walk(
-    config: WalkConfig,
-    robot: Robot,
-    job: Job,
-    *,
-    build: BuildPlant = MujocoPlant,
+    config: WalkConfig, robot: Robot, job: Job, *, build: BuildPlant = MujocoPlant
 ) -> Trajectory:
     """Walk once, by default in MuJoCo C.
 

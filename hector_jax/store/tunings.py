@@ -88,10 +88,7 @@ def rollouts_of(config: TuneConfig, robot: Robot, problem: Problem) -> list[Scen
 
 
 def _usable(
-    config: TuneConfig,
-    problem: Problem,
-    scenarios: list[Scenario],
-    found: Sequence[Evaluation],
+    config: TuneConfig, problem: Problem, scenarios: list[Scenario], found: Sequence[Evaluation]
 ) -> tuple[list[Scenario], Float[np.ndarray, " n"]]:
     """Return the rollouts of a problem that count, and their losses at the start.
 

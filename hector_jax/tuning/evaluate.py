@@ -31,12 +31,7 @@ class Evaluation(NamedTuple):
 
 
 def evaluate(
-    config: RolloutConfig,
-    scenario: Any,
-    weights: Weights,
-    loss: Loss,
-    *,
-    walk: Walk = rollout,
+    config: RolloutConfig, scenario: Any, weights: Weights, loss: Loss, *, walk: Walk = rollout
 ) -> Evaluation:
     """Compute the loss of a weight set on the model and its gradient, in one program.
 
