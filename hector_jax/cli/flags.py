@@ -67,8 +67,8 @@ _GROUPS = {"log": ("check", "twin", "add"), "steps": ("collect", "train", "grfm"
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
 def _command(kind: type[T]) -> type[T]:
     name = kind.__name__.lower()
-    groups = [f"{group} " for group, names in _GROUPS.items() if name in names]
-    COMMANDS["".join([*groups, name])] = kind
+    group = next((f"{word} " for word, names in _GROUPS.items() if name in names), "")
+    COMMANDS[group + name] = kind
     return dataclass(frozen=True)(kind)
 
 

@@ -61,7 +61,7 @@ _EXIT_CODES = "Exit codes: 0 done, 1 something is broken, 2 bad input, 130 inter
 _ALL = "--help-all"
 _HELP = ("-h", "--help", _ALL)
 _COMPLETION = "--tyro-print-completion"
-_TOPS = tuple(dict.fromkeys(name.split()[0] for name in COMMANDS if " " in name))
+_GROUPS = tuple(dict.fromkeys(name.split()[0] for name in COMMANDS if " " in name))
 _LATEST = Path("latest")  # stands for `latest_run`
 _NUMBERS: dict[Any, str] = {int: "a whole number", float: "a number"}
 
@@ -79,7 +79,7 @@ def _command(words: Sequence[str]) -> str:
     moved = {"report": "log add"} | {name.split()[-1]: name for name in COMMANDS if " " in name}
     hint = f"; it is `hector {moved[word]}` now" if word in moved else did_you_mean(two, COMMANDS)
     hint = hint or did_you_mean(word, COMMANDS) or f"; the commands are {', '.join(COMMANDS)}"
-    raise InputError(f"unknown command {short_repr(two if word in _TOPS else word)}{hint}")
+    raise InputError(f"unknown command {short_repr(two if word in _GROUPS else word)}{hint}")
 
 
 def from_line(words: Sequence[str]) -> Any:
@@ -96,7 +96,7 @@ def from_line(words: Sequence[str]) -> Any:
     rest = [word for word in words if word not in _HELP]
     if rest[:1] == [_COMPLETION]:
         return _all_commands(words)
-    if not rest or (len(rest) == 1 and rest[0] in _TOPS):
+    if not rest or (len(rest) == 1 and rest[0] in _GROUPS):
         print(overview(*rest))
         raise SystemExit(0)
     name = _command(rest)
@@ -138,11 +138,11 @@ def _print_help(kind: Any, whole: bool, **options: Any) -> Any:
     raise SystemExit(0)
 
 
-def overview(top: str = "") -> str:
-    """Return the text of `hector --help`, or of the commands of two words that begin with one."""
-    lines = [] if top else [_HEAD]
+def overview(group: str = "") -> str:
+    """Return the text of `hector --help`, or of the commands of a group, such as `log`."""
+    lines = [] if group else [_HEAD]
     for heading, commands in OVERVIEW.items():
-        rows = [f"  {name:<14s}{text}" for name, text in commands.items() if name.startswith(top)]
+        rows = [f"  {name:<14s}{text}" for name, text in commands.items() if name.startswith(group)]
         lines += [f"{heading}:", *rows, ""] if rows else []
     return "\n".join([*lines, _EXIT_CODES])
 
@@ -156,10 +156,10 @@ def _all_commands(words: Sequence[str]) -> Any:
             for name, kind in COMMANDS.items()
             if name.startswith(prefix) and " " not in name.removeprefix(prefix)
         ]
-        tops = () if prefix else _TOPS
-        groups = (make_dataclass(top.title(), [("command", union(f"{top} "))]) for top in tops)
-        named = (Annotated[group, tyro.conf.subcommand(group.__name__.lower())] for group in groups)
-        return Union[(*kinds, *named)]  # noqa: UP007
+        for group in () if prefix else _GROUPS:
+            of_group = make_dataclass(group, [("command", union(f"{group} "))])
+            kinds.append(Annotated[of_group, tyro.conf.subcommand(group)])
+        return Union[tuple(kinds)]  # noqa: UP007
 
     return _tyro(union(""), words, prog="hector")
 

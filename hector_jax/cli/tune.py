@@ -48,7 +48,7 @@ from hector_jax.verdict import judging, metrics
 from hector_jax.verdict.judging import ScoredWalks
 from hector_jax.walk_tuning import best_set
 from hector_jax.walk_tuning.campaign import Campaign
-from hector_jax.walk_tuning.walks import WalkTuning, first_slope, from_best_of, tune_on_walks
+from hector_jax.walk_tuning.walks import WalkTuning, first_slope, tune_on_walks, with_best_start
 
 _ARTEFACTS = "kept"  # folder in it
 
@@ -278,7 +278,7 @@ def _tune_sets(run: _Run, net: nets.TrainedNet) -> _Tuned:
     if budget:
         tuned = {name: sets[name] for name in ("best", "with", "without")}
         starts = {n: w._replace(others={**start.others, **w.others}) for n, w in tuned.items()}
-        campaign = from_best_of(setup.pool, campaign, starts | {"start": start})
+        campaign = with_best_start(setup.pool, campaign, starts | {"start": start})
         walks = tune_on_walks(setup.pool, campaign, walks=budget)
         if not walks.sets[0].accepted:
             say(f"no steps on walks: {walks.reason}")

@@ -138,7 +138,10 @@ def first_slope(campaign: Campaign) -> None:
     _slope(campaign, campaign.start, 0, walk_case(campaign, campaign.start, 0).log)
 
 
-def from_best_of(pool: Executor, campaign: Campaign, starts: Mapping[str, Weights]) -> Campaign:
+# The choice of the start
+
+
+def with_best_start(pool: Executor, campaign: Campaign, starts: Mapping[str, Weights]) -> Campaign:
     """Return the campaign from that of several starts which walks best.
 
     Each walks on the first plants; of those that fall least often it is that with the least mean of
