@@ -35,10 +35,10 @@ engines: $(STAMP) ## install the other engines, Drake and Pinocchio, and dask fo
 tune: $(STAMP) ## tune and evaluate: make tune TRAJ=straight|c|s|all, TRAJ="c s", ROBOT=robot.toml
 	@$(BIN)/hector tune --traj $(TRAJ) $(if $(ROBOT),--robot $(ROBOT))
 
-MODELS := --light-heavy --plant examples/hector-v2/robot.toml
+MODELS := --plant light heavy examples/hector-v2/robot.toml
 
 verdict: $(STAMP) ## sets in all engines and models: make verdict WEIGHTS="nominal mine.json"
-	@$(BIN)/hector verdict --engine all $(MODELS) --weights $(or $(WEIGHTS),nominal expert best)
+	@$(BIN)/hector evaluate --traj all --engine all $(MODELS) --out runs/verdict --weights $(or $(WEIGHTS),nominal expert best)
 
 grfm: $(STAMP) ## how well the nets predict the ground forces: runs/grfm/report.md
 	@$(BIN)/hector steps grfm

@@ -104,7 +104,7 @@ def test_a_public_name_stands_in_one_module():
         if not node.name.startswith("_")
     )
     phi = {"init", "fit", "apply", "with_statistics"}
-    of_flags = {"Check", "Robot", "Verdict", "View"}
+    of_flags = {"Check", "Robot", "View"}
     assert {name for name, count in found.items() if count > 1} == phi | of_flags
 
 

@@ -58,6 +58,7 @@ def test_a_first_word_of_two_shows_the_commands_that_begin_with_it(monkeypatch, 
         ("check x.npz", "unknown command 'check'; it is `hector log check` now"),
         ("report runs x.npz", "unknown command 'report'; it is `hector log add` now"),
         ("train", "unknown command 'train'; it is `hector steps train` now"),
+        ("compare a b", "unknown command 'compare'; it is `hector evaluate --runs` now"),
         ("log chekc x.npz", "unknown command 'log chekc'; did you mean 'log check'?"),
         ("eval", "unknown command 'eval'; did you mean 'evaluate'?"),
     ],
@@ -158,9 +159,9 @@ def test_a_step_with_settings_of_its_own_leaves_what_a_tuning_reads(monkeypatch,
     paths = []
     instead(monkeypatch, nets, "train_net", lambda *args: paths.append(args[-1]) or trained)
     instead(monkeypatch, nets, "collect_walks", lambda *args: paths.append(args[-1]))
-    for line in ("", "--epochs 5", "--data data/more", "--variant paper --seed 2", "--out a.npz"):
+    for line in ("", "--epochs 5", "--data data/more", "--variant paper", "--out a.npz"):
         assert call(monkeypatch, "steps", "train", *line.split(), "--json") == 0
-    found = "data/grfm data/grfm-epochs-5 data/grfm-more data/grfm-paper-seed-2 a".split()
+    found = "data/grfm data/grfm-epochs-5 data/grfm-more data/grfm-paper a".split()
     assert paths == [Path(f"{name}.npz") for name in found]
     paths.clear()
     for line in ("", "--engine c", "--walks 128", "--walks 128 --out data/walks"):
@@ -246,10 +247,9 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     # one set for two trajectories, from those weights, on the same data
     start, flags = run / "weights" / "with.json", ("--seeds", "1", "--iterations", "4")
     several = ("--traj", "straight", "c", "--start", start, "--no-video", "--out", "both")
-    several += ("--tune", "turn_lead", "--net", Path("data/grfm.npz"), "--verdict", "--walks", "0")
+    several += ("--tune", "turn_lead", "--net", Path("data/grfm.npz"), "--walks", "0")
     assert call(monkeypatch, "tune", *flags, *several) == 0
     out = capsys.readouterr().out
-    assert "change of L against nominal in %" in out
     for title in ("straight, c, 1 plant", "straight, 1 plant", "c, 1 plant"):
         assert f"\n{title} on the" in f"\n{out}"
     result = json.loads(Path("both/result.json").read_text())

@@ -69,7 +69,7 @@ def test_an_address_where_nobody_answers_is_one_line(address, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_verdict_is_the_same_where_a_worker_is_killed_on_the_way(two, monkeypatch, tmp_path):
+def test_an_evaluation_is_the_same_where_a_worker_is_killed_on_the_way(two, monkeypatch, tmp_path):
     def kill():
         while not list(tmp_path.glob("cluster/runs/verdict/scores/*.npz")):
             time.sleep(0.01)
@@ -80,8 +80,8 @@ def test_a_verdict_is_the_same_where_a_worker_is_killed_on_the_way(two, monkeypa
     for name, address in (("cluster", ["--cluster", two.scheduler_address]), ("here", [])):
         (tmp_path / name).mkdir()
         monkeypatch.chdir(tmp_path / name)
-        flags = "--traj straight --seeds 4 --seconds 0.1".split()
-        assert call(monkeypatch, "verdict", *flags, *address) == 0
+        flags = "--traj straight --seeds 4 --seconds 0.1 --out runs/verdict".split()
+        assert call(monkeypatch, "evaluate", *flags, *address) == 0
         results.append(Path("runs/verdict/verdict.json").read_bytes())
     assert not killer.is_alive()
     assert results[0] == results[1]

@@ -45,7 +45,7 @@ def runs(tmp_path):
 
 
 def test_a_comparison_tells_losses_falls_iterations_and_what_differs(monkeypatch, capsys, runs):
-    assert call(monkeypatch, "compare", *runs, "--json") == 0
+    assert call(monkeypatch, "evaluate", "--runs", *runs, "--json") == 0
     out, err = capsys.readouterr()
     assert err == ""
     told = json.loads(out)  # and nothing else
@@ -83,5 +83,5 @@ def test_runs_of_different_losses_are_said_to_be_so(monkeypatch, capsys, tmp_pat
         run_folder(tmp_path / "one", Tune(), {}),
         run_folder(tmp_path / "two", Tune(alpha="auto", seeds=32), {}, weight),
     ]
-    assert call(monkeypatch, "compare", *runs) == 0
+    assert call(monkeypatch, "evaluate", "--runs", *runs) == 0
     assert capsys.readouterr().out.count("losses differ") == said

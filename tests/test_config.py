@@ -35,7 +35,7 @@ def test_keys_are_spelt_as_flags_or_as_fields_and_lists_and_whole_numbers_are_ta
 
 
 _MORE = {"tune": "friction", "engine": "drake"}  # of tuples
-_MORE |= dict.fromkeys(("plant", "walker_uses"), Path("more"))
+_MORE |= dict.fromkeys(("runs", "walker_uses"), Path("more"))
 
 
 @pytest.mark.parametrize("kind", [k for k in COMMANDS.values() if issubclass(k, Configured)])

@@ -16,7 +16,7 @@ from pretend import call
 from test_docs import READ, README, ROOT, lines_of
 from test_walks import HandsOver
 
-from hector_jax.cli import commands, evaluate, flags, propose, tune, verdict, walker
+from hector_jax.cli import commands, evaluate, flags, propose, tune, walk, walker
 from hector_jax.control.weights import expert
 from hector_jax.control.weights_file import save_weights
 from hector_jax.grfm.training import TrainConfig
@@ -28,14 +28,13 @@ LENGTHS = {"short": 0.2, "long": 1.5}  # a log of a walker is checked, which tak
 SPEEDS = {"straight": 0.3, "c": 0.25, "s": 0.2, "slalom": 0.15}
 SMALL = {
     "tune": "--iterations 1 --seeds 1 --no-video --walk-plants 1",
-    "evaluate": "--seeds 1",
-    "verdict": "--seeds 1 --model-seeds 1 --engine-seeds 1",
+    "evaluate": "--seeds 1 --other-seeds 1",
     "collect": "--walks 3 --seconds 0.2 --engine c",
     "train": "--epochs 1",
-    "view": "--headless",
+    "view": "--out shown",
 }
 """Flags that make a line of a command small, in the place of its own."""
-SECONDS = {"walk": 0.2, "evaluate": 0.2, "verdict": 0.2, "check": 1.5, "twin": 1.5}
+SECONDS = {"walk": 0.2, "evaluate": 0.2, "check": 1.5, "twin": 1.5}
 """Lengths of the walks of a command; those of others are as long as a trajectory's file says."""
 ELSEWHERE = ("--cluster", "--help", "doctor")  # a scheduler; no work; the machine's
 
@@ -100,13 +99,13 @@ PAIRS = [
     "hector export runs/four",
     "hector tune --traj straight --variant paper --walks 0 --out runs/paper",
     "hector export runs/paper",
-    "hector tune --traj straight c --each --walks 4 --safe 0.05 --out runs/each",
-    "hector tune --resume runs/each/short-c",
-    "hector tune --traj straight --start best --alpha auto --verdict --json --out runs/judged",
+    "hector tune --traj c --walks 4 --safe 0.05 --out runs/safe",
+    "hector tune --resume runs/safe",
+    "hector tune --traj straight --start best --alpha auto --json --out runs/judged",
     "hector tune --traj straight --net data/more.npz --out runs/net",
     "hector view runs/net",
     "hector tune --resume runs/net",
-    "hector compare runs/smooth runs/net",
+    "hector evaluate --runs runs/smooth runs/net",
     "hector tune --walker mine.py --robot mine.toml --walks 4 --out runs/own",
     "hector tune --resume runs/own",
 ]
@@ -152,7 +151,7 @@ def console(tmp_path_factory):
         patch.setattr(nets, "CollectConfig", lambda *given: asked(*given) if given else small)
         patch.setattr(nets, "TrainConfig", TwoEpochs)
         patch.setattr(nets, "tuning_paths", lambda *_, **__: [])
-        for module in (commands, evaluate, propose, tune, verdict, walker):
+        for module in (commands, evaluate, propose, tune, walk, walker):
             patch.setattr(module, "workers", lambda *_: nullcontext(pool))
         for folder in ("assets", "examples"):
             Path(folder).symlink_to(ROOT / folder)

@@ -11,7 +11,7 @@ import pytest
 from pretend import refused
 
 from hector_jax.cli import commands
-from hector_jax.cli.flags import COMMANDS, Compare, Evaluate, Export, Tune, View, Walk, named_file
+from hector_jax.cli.flags import COMMANDS, Evaluate, Export, Tune, View, Walk, named_file
 from hector_jax.cli.parse import check_flags, from_line, resolve_latest
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError
@@ -31,7 +31,9 @@ def test_flags_are_taken_in_any_order_and_spelling():
     assert from_line("export --set without runs/a --json".split()) == Export(
         Path("runs/a"), set="without", json=True
     )
-    assert from_line("compare --json a b".split()) == Compare((Path("a"), Path("b")), json=True)
+    assert from_line("evaluate --json --runs a b".split()) == Evaluate(
+        runs=(Path("a"), Path("b")), json=True
+    )
     assert from_line(["walk", "--out=-dash.npz"]) == Walk(out=Path("-dash.npz"))
 
 
@@ -103,7 +105,7 @@ def test_a_file_that_cannot_be_read_is_told_before_anything_is_loaded(
 
 
 @pytest.mark.parametrize(
-    "words", ["tune --data", "tune --runs", "steps grfm --out", "steps collect --out"]
+    "words", ["tune --data", "evaluate --out", "steps grfm --out", "steps collect --out"]
 )
 def test_a_folder_that_cannot_be_one_is_told_before_anything_is_made(
     monkeypatch, capsys, tmp_path, words
@@ -133,7 +135,7 @@ def test_latest_is_the_tuning_that_began_last(monkeypatch, capsys, tmp_path):
     write_json(tmp_path / "runs" / "robot" / "config.json", {"flags": {}})
     for words in (["view", "latest"], ["export", "latest"]):
         assert resolve_latest(from_line(words)).run == Path("runs/strider/s/2")
-    found = resolve_latest(from_line(["compare", "runs/c/1", "latest"]))
+    found = resolve_latest(from_line(["evaluate", "--runs", "runs/c/1", "latest"]))
     assert found.runs == (Path("runs/c/1"), Path("runs/strider/s/2"))
     assert "latest is runs/strider/s/2\n" in capsys.readouterr().err
     found = resolve_latest(from_line(["tune", "--resume", "latest"]))
@@ -160,10 +162,9 @@ def test_what_is_given_beside_what_already_fixes_it_is_refused(line, fault):
         commands.run(from_line(line.split()))
 
 
-@pytest.mark.parametrize("name", ["evaluate", "verdict"])
-def test_a_word_in_a_file_is_a_list_of_one(tmp_path, name):
+def test_a_word_in_a_file_is_a_list_of_one(tmp_path):
     (tmp_path / "flags.toml").write_text('weights = "nominal"\n')
-    flags = from_line([name, "--config", str(tmp_path / "flags.toml")])
+    flags = from_line(["evaluate", "--config", str(tmp_path / "flags.toml")])
     assert flags.weights == ("nominal",)
 
 
@@ -172,7 +173,7 @@ def test_a_path_with_an_equals_sign_is_a_file_where_there_is_one(monkeypatch, tm
     write_json(Path("a=b/mine.json"), {})
     assert named_file("a=b/mine.json") == ("", "a=b/mine.json")
     assert named_file("c=b/mine.json") == ("c", "b/mine.json")
-    check_flags(from_line(["verdict", "--weights", "nominal", "a=b/mine.json"]))
+    check_flags(from_line(["evaluate", "--weights", "nominal", "a=b/mine.json"]))
 
 
 # Names that are not text

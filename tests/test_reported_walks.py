@@ -17,7 +17,7 @@ import pytest
 from pretend import instead
 from test_walks import HandsOver, same, same_sets
 
-from hector_jax.cli import evaluate, propose
+from hector_jax.cli import propose, walk
 from hector_jax.cli.flags import Add, Propose, Walk
 from hector_jax.control.trajectories import load_command
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
@@ -462,16 +462,16 @@ def test_the_log_of_a_walk_with_the_proposed_file_is_taken(folder, capsys):
     uneven = start.R._replace(force=start.R.force * [[1.0], [2.0 / 3.0]])
     save_weights(Path("uneven.json"), start._replace(R=uneven))
 
-    def walk(weights, **flags):
-        evaluate.run_walk(Walk(traj="ahead.toml", weights=weights, out=Path("log.npz"), **flags))
+    def walked(weights, **flags):
+        walk.run_walk(Walk(traj="ahead.toml", weights=weights, out=Path("log.npz"), **flags))
         return "log.npz"
 
     next_walk(folder, ("ahead",), start="uneven.json")
     first = result(capsys)["weights"]
-    refused(folder, f"other weights than the proposed ones, {first}", walk("uneven.json"))
-    report(folder, walk(first))
+    refused(folder, f"other weights than the proposed ones, {first}", walked("uneven.json"))
+    report(folder, walked(first))
     next_walk(folder)  # the other flags are those of the folder
     second = result(capsys)["weights"]
-    refused(folder, f"other weights than the proposed ones, {second}", walk(first))
-    report(folder, f"ahead={walk(second, world='standin', seed=3)}")
+    refused(folder, f"other weights than the proposed ones, {second}", walked(first))
+    report(folder, f"ahead={walked(second, world='standin', seed=3)}")
     assert result(capsys)["walk"] == 1

@@ -178,7 +178,7 @@ with locked(Path(sys.argv[1])):
     [
         (("steps", "collect", "--walks", "3", "--out", "walks"), "walks"),
         (("steps", "train", "--data", "walks"), "."),
-        (("verdict", "--out", "judged"), "judged"),
+        (("evaluate", "--out", "judged"), "judged"),
         (("propose", "reported"), "reported"),
     ],
 )
@@ -311,7 +311,7 @@ def resume(*words, folder="run"):
 def begun(tmp_path, monkeypatch):
     """The folder of a run that was cut at once, in the working directory."""
     monkeypatch.chdir(tmp_path)
-    return run_folder.begin(tmp_path / "run", flags.Tune(out=tmp_path / "run", **OWN))
+    return run_folder.begin(tmp_path / "run", flags.Tune(out=tmp_path / "run", **OWN))[0]
 
 
 def test_what_changes_no_number_stays_as_it_was_unless_another_is_given(begun):
@@ -334,7 +334,6 @@ def test_a_run_whose_data_are_elsewhere_is_refused_at_once(begun, tmp_path, monk
     [
         ({}, "--seeds 8", "run: begun with --seeds 3, got 8"),  # the default
         ({}, "--out other", "only one can be given"),
-        ({}, "--each", "run: no runs of single trajectories; leave out --each"),
         ({"code": "another"}, "", "run: made by other code or other versions"),
         ({"robot": "another"}, "", "run: made for another robot"),
         (None, "", "run/config.json: cannot read a file of a run of"),
@@ -368,25 +367,16 @@ def test_a_run_of_another_trajectory_or_start_is_not_taken_up(begun, then, now, 
         run_folder.note_settings(begun, now)
 
 
-def test_runs_have_folders_of_their_own(tmp_path, monkeypatch):
-    """Those of the same second and, with --each, of several trajectories."""
+def test_runs_of_one_second_have_folders_of_their_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("mine.toml").write_text('name = "short"\n[[segment]]\nseconds = 2.0\nv_x = 0.2\n')
-    folders = [run_folder.begin(tmp_path / "20261121-235959", flags.Tune()) for _ in range(3)]
-    assert [folder.name[-6:] for folder in folders] == ["235959", "000000", "000001"]
-    each = flags.Tune(traj=("c", "mine.toml"), each=True)
-    runs = run_folder.by_folder(each, Path("out"), ROBOT)
-    assert list(runs) == [Path("out/c"), Path("out/short")]
-    for folder, args in runs.items():
-        run_folder.begin(folder, args)
-    again = flags.Tune(resume=Path("out"), each=True)
-    assert list(run_folder.by_folder(again, again.resume, ROBOT)) == list(runs)
-    for args, fault in (
-        (replace(again, each=False), "out: its trajectories were tuned one by one; add --each"),
-        (replace(each, each=False), "of one length, got c 4 s, short 2 s; add --each"),
-    ):
-        with pytest.raises(InputError, match=fault):
-            command.run_tune(args)
+    folder, args = tmp_path / "20261121-235959", flags.Tune()
+    names = [run_folder.begin(folder, args)[0].name[-6:] for _ in range(3)]
+    assert names == ["235959", "000000", "000001"]
+    new, given = run_folder.of_flags(flags.Tune(traj=("mine.toml",)))
+    assert (new.parent, given.traj) == (Path("runs/short"), ("mine.toml",))
+    with pytest.raises(InputError, match="of one length, got c 4 s, short 2 s"):
+        command.run_tune(flags.Tune(traj=("c", "mine.toml")))
 
 
 @pytest.mark.slow

@@ -113,12 +113,12 @@ def test_metrics_of_a_run_that_goes_on_are_read_and_its_newest_weights_taken(tmp
 
 def test_what_is_no_run_is_refused_in_one_line(monkeypatch, capsys, tmp_path):
     for fault in (": cannot read a file of a run of", ": expected a JSON object"):
-        line = refused(monkeypatch, capsys, "view", tmp_path, "--headless")
+        line = refused(monkeypatch, capsys, "view", tmp_path, "--out", tmp_path / "out")
         assert line.startswith(f"hector: {tmp_path}/config.json{fault}")
         (tmp_path / "config.json").write_text("[]")
 
 
-def test_headless_writes_film_and_pictures_instead(monkeypatch, capsys, tmp_path):
+def test_a_folder_gets_film_and_pictures_instead(monkeypatch, capsys, tmp_path):
     filmed = []
     for write in ("write_film", "write_strip"):
         monkeypatch.setattr(pictures, write, lambda *film: filmed.append(film))
@@ -185,7 +185,7 @@ def test_only_the_net_of_the_run_predicts(monkeypatch, capsys, tmp_path, own):
     save_net(run / "data" / "grfm.npz", net, robot=load_robot(), about={})
     path = run / "config.json"
     write_json(path, json.loads(path.read_text()) | {"net": tree_hash(net) if own else "another"})
-    words = ["--world", "srbm", "--sets", "nominal", "expert", "--headless"]
+    words = ["--world", "srbm", "--sets", "nominal", "expert", "--out", tmp_path / "out"]
     assert call(monkeypatch, "view", run, *words) == 0
     assert [list(effects) for effects in drawn] == [["residual"] if own else []] * 2
     assert ("grfm.npz is not the net of this run" in capsys.readouterr().err) != own

@@ -348,8 +348,8 @@ def test_hector_evaluate_takes_it_as_an_engine(tmp_path, monkeypatch, capsys):
     path = program(tmp_path)
     assert call(monkeypatch, "evaluate", "--walker", path, "--seeds", 2, "--json") == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["engine"] == "mine.py"
-    assert found["sets"]["nominal"]["standin"]["falls"] == 0
+    assert [column["engine"] for column in found["columns"]] == ["mine.py"]
+    assert found["sets"]["nominal"]["falls"] == 0
     line = ("evaluate", "--walker", path, "--engine", "c")
     assert call(monkeypatch, *line) == 2
     assert "--engine and --walker: only one can be given" in capsys.readouterr().err
@@ -376,7 +376,10 @@ def test_hector_tune_finds_what_its_walks_show(tmp_path, monkeypatch, capsys):
     assert found["sets"]["best"]["standin"]["change"]["start"]["median"] < -1.0
     best = json.loads((tmp_path / "run" / "weights" / "best.json").read_text())
     assert abs(np.log(best["Q"]["position"][1] / 500.0)) < 0.7
-    for words in (("view", tmp_path / "run", "--headless"), ("export", tmp_path / "run")):
+    for words in (
+        ("view", tmp_path / "run", "--out", tmp_path / "out"),
+        ("export", tmp_path / "run"),
+    ):
         assert call(monkeypatch, *words) == 2
         assert f"its walks are those of {tmp_path / 'mine.py'}" in capsys.readouterr().err
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hector_jax.cli.flags import Check, Collect, Evaluate, Train, Tune, Verdict, View, Walk
+from hector_jax.cli.flags import Check, Collect, Evaluate, Train, Tune, View, Walk
 from hector_jax.control import trajectories
 from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import gait_named
@@ -47,7 +47,7 @@ def weights_by_name(text: str, robot: Robot) -> Weights:
     return named[text](robot) if text in named else load_weights(Path(text), robot)
 
 
-def engine_of(args: Evaluate | Tune | Verdict | Walk) -> Engine:
+def engine_of(args: Evaluate | Tune | Walk) -> Engine:
     """Return the engine that the flags name, or the program of the user in its place.
 
     Raises:
@@ -58,7 +58,7 @@ def engine_of(args: Evaluate | Tune | Verdict | Walk) -> Engine:
         return choose_engine(getattr(args, flag))
     if args.is_given(flag):
         raise InputError(f"--{flag.replace('_', '-')} and --walker: only one can be given")
-    for name in ("gait", "light_heavy", "plant"):
+    for name in ("gait", "plant"):
         if hasattr(args, name) and args.is_given(name):
             text = f"--{name.replace('_', '-')} is for this project's controller and simulators"
             raise InputError(f"{text}, so not beside --walker")
@@ -221,12 +221,8 @@ def trajectories_by_name(texts: Sequence[str]) -> dict[str, str]:
     return names
 
 
-def load_trajectories(
-    texts: Sequence[str], robot: Robot, hint: str = ""
-) -> tuple[NamedCommand, ...]:
+def load_trajectories(texts: Sequence[str], robot: Robot) -> tuple[NamedCommand, ...]:
     """Load the trajectories of one weight set; `all` are the three of the paper.
-
-    `hint` ends the error message about different lengths.
 
     Raises:
         InputError: see `load_trajectory` and `trajectories_by_name`; or their lengths differ.
@@ -235,11 +231,11 @@ def load_trajectories(
     lengths = {trajectory.name: trajectory.seconds or Walk.seconds for trajectory in loaded}
     if len(set(lengths.values())) > 1:
         lasts = ", ".join(f"{name} {seconds:g} s" for name, seconds in lengths.items())
-        raise InputError(f"--traj expects trajectories of one length, got {lasts}{hint}")
+        raise InputError(f"--traj expects trajectories of one length, got {lasts}")
     return loaded
 
 
-def walk_seconds(args: Check | Evaluate | Verdict | Walk | View, trajectory: NamedCommand) -> float:
+def walk_seconds(args: Check | Evaluate | Walk | View, trajectory: NamedCommand) -> float:
     """Return the length of a walk [s]: from the trajectory's file if it has one, else --seconds.
 
     Raises:

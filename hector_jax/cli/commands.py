@@ -6,13 +6,13 @@ from functools import partial, singledispatch
 from pathlib import Path
 from typing import Any
 
-from hector_jax.cli import arguments, doctor, evaluate, flags, propose, tune, verdict, view, walker
+from hector_jax.cli import arguments, doctor, evaluate, flags, propose, tune, view, walk, walker
 from hector_jax.cli.arguments import print_result
 from hector_jax.control.controller import walk_config
 from hector_jax.control.twin import TwinConfig
 from hector_jax.control.weights import nominal
 from hector_jax.core.console import say
-from hector_jax.core.files import locked, write_file, write_json
+from hector_jax.core.files import locked, write_file
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
 from hector_jax.core.settings import as_toml
@@ -22,11 +22,10 @@ from hector_jax.grfm.training import TrainConfig
 from hector_jax.importing.propose import RobotProposal, propose_robot, standard_form
 from hector_jax.importing.remarks import differences, remarks
 from hector_jax.importing.table import changes_of_model, section, table_of
-from hector_jax.report.compare import compare_runs, print_comparison
 from hector_jax.robot.model import load_robot
 from hector_jax.sim import margin
 from hector_jax.store import nets
-from hector_jax.store.folder import RESULT, load_run, read_request
+from hector_jax.store.folder import read_request
 from hector_jax.tuning.loss import loss_of_robot
 
 
@@ -43,14 +42,13 @@ def run(args: Any) -> None:
 for _command in (
     doctor.run_doctor,
     evaluate.run_evaluate,
-    evaluate.run_walk,
-    evaluate.run_grfm,
+    walk.run_walk,
+    walk.run_grfm,
     walker.run_check,
     walker.run_twin,
     propose.run_propose,
     propose.run_add,
     tune.run_tune,
-    verdict.run_verdict,
     view.run_view,
 ):
     run.register(_command)
@@ -72,7 +70,7 @@ def run_collect(args: flags.Collect) -> None:
 @run.register
 def run_train(args: flags.Train) -> None:
     """Train a net on walks."""
-    config = TrainConfig(args.variant, epochs=args.epochs, seed=args.seed)
+    config = TrainConfig(args.variant, epochs=args.epochs)
     robot = load_robot(args.robot)
     data = arguments.flag_folder(args, "data", robot)
     path = args.out or nets.own_path(data, config)
@@ -81,19 +79,6 @@ def run_train(args: flags.Train) -> None:
     result = {"net": str(path), "errors": errors}
     print_result(args.json, result, partial(arguments.print_errors, errors))
     say(f"the net is in {path}")
-
-
-@run.register
-def run_compare(args: flags.Compare) -> None:
-    """Put finished runs side by side."""
-    finished = [folder for folder in args.runs if (folder / RESULT).exists()]
-    for folder in args.runs:
-        if finished and folder not in finished:
-            say(f"{folder} is left out: it is not a finished run")
-    comparison = compare_runs([load_run(folder) for folder in finished or args.runs])
-    if args.out is not None:
-        write_json(args.out, comparison)
-    print_result(args.json, comparison, partial(print_comparison, comparison))
 
 
 @run.register
@@ -180,7 +165,7 @@ def run_export(args: flags.Export) -> None:
     request = read_request(args.run) if is_run else None
     config = export.controller_of_run(args.run) if is_run else None
     robot = arguments.robot_of_run(args.run, request) if request else load_robot(args.robot)
-    text = args.traj or (request.trajectory if request else "straight")
+    text = request.trajectory if request else "straight"
     trajectory = arguments.load_trajectory(text, robot)
     name = f"{args.run.resolve().name}/{path.stem}" if is_run else path.stem
     weights = arguments.weights_by_name(str(path), robot)

@@ -1,232 +1,238 @@
-"""Evaluate weight sets on walks, and nets on the ground forces of held-out walks."""
+"""`hector evaluate`: weight sets in engines and models of the robot, or finished runs."""
 
-from dataclasses import replace
+from collections.abc import Iterable
+from contextlib import nullcontext
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from typing import Any
-
-import jax
-import numpy as np
+from typing import NamedTuple, get_args
 
 from hector_jax.cli import arguments
 from hector_jax.cli.arguments import print_result
-from hector_jax.cli.flags import Evaluate, Grfm, Walk
-from hector_jax.cli.parse import as_table
-from hector_jax.control.controller import walk_config
-from hector_jax.control.reference import COMMANDS, named_command
-from hector_jax.control.weights import expert, nominal
-from hector_jax.core.console import Broken, bar, say, say_if_slow
-from hector_jax.core.files import make_folder, write_json
-from hector_jax.core.inputs import InputError, plural, printable
+from hector_jax.cli.flags import BASELINES, OTHER_MASSES, Evaluate, WalkEngine, named_file
+from hector_jax.cli.parse import as_command, as_table
+from hector_jax.control.trajectories import NamedCommand
+from hector_jax.control.weights import Weights
+from hector_jax.core.console import say
+from hector_jax.core.environment import environment
+from hector_jax.core.files import locked
+from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
-from hector_jax.core.trajectory import SOLVED
-from hector_jax.core.tree import stack
-from hector_jax.core.tree_file import save_tree
-from hector_jax.grfm import training
-from hector_jax.grfm.dataset import at_interval, make_dataset
-from hector_jax.grfm.effect import last_command
-from hector_jax.grfm.network import as_effect
-from hector_jax.report import fidelity, pictures
+from hector_jax.core.settings import SEED
+from hector_jax.report import matrix as report
+from hector_jax.report.compare import compare_runs, print_comparison
 from hector_jax.report.report import print_table
-from hector_jax.report.video import check_film
-from hector_jax.robot.model import load_robot
-from hector_jax.sim.diagnosis import Fall, fall_of
-from hector_jax.sim.engine import MUJOCO_C
+from hector_jax.robot.model import Robot, load_robot
+from hector_jax.sim.engine import Engine, choose_engine
 from hector_jax.sim.loop import Job
-from hector_jax.store import nets, tunings
-from hector_jax.store.collection import Walks
+from hector_jax.store import tunings
+from hector_jax.store.folder import RESULT, load_run
 from hector_jax.store.setup import Setup
-from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.loss import Loss, loss_of_robot
 from hector_jax.verdict import judging, metrics
-from hector_jax.walk_tuning.walk_log import walk_card
+from hector_jax.verdict.matrix import OWN, Cells, Column
+
+
+class PlantModel(NamedTuple):
+    """A model of the robot that plants are drawn from."""
+
+    mass: float = 1.0  # factor of the mass of each plant
+    plant: Robot | None = None  # None: the robot's own model
+
+
+class EvaluationPlan(NamedTuple):
+    """The walks to make."""
+
+    robot: Robot
+    world: str
+    trajectories: dict[str, tuple[NamedCommand, float]]  # by name, with the length of walks [s]
+    sets: dict[str, dict[str, Weights]]  # by trajectory and set
+    models: dict[str, PlantModel]
+    columns: dict[Column, range]  # with the seeds of its plants
+    engines: dict[str, Engine]
+
+    @property
+    def differs(self) -> dict[str, str]:
+        """Differences of the plants in each engine from those in MuJoCo C."""
+        return {name: engine.differs for name, engine in self.engines.items() if engine.differs}
 
 
 def run_evaluate(args: Evaluate) -> None:
-    """Evaluate weight sets on the plants of a world."""
-    robot = arguments.with_gait(load_robot(args.robot), args.gait)
-    plant = arguments.plant_of(args.plant, robot)
-    trajectory = arguments.load_trajectory(args.traj, robot)
-    seconds = arguments.walk_seconds(args, trajectory)
-    count = args.seeds
-    if args.world in ("ideal", "hfs"):  # one plant each, and nothing random
-        for name, only in (("seeds", 1), ("first_seed", 0)):
+    """Walk weight sets in engines and models, and print a table or the claims that hold."""
+    if args.runs:
+        _compare(args)
+        return
+    plan = plan_of(args)
+    say(_plan_text(plan))
+    made_with, out = environment(), args.out
+    with nullcontext() if out is None else locked(out):
+        with workers(args.processes, args.cluster) as pool:
+            setup = Setup(pool, tunings.tune_config(plan.robot), plan.robot)
+            cells = walk_cells(setup, plan, out / "scores" if out else None)
+        result = report.matrix_report(cells, plan.differs, plan.world)
+        if out is not None:
+            facts = {"config": {"flags": as_table(args)}, "environment": made_with}
+            command = as_command("hector evaluate", args)
+            result = report.write_matrix_report(out, cells, result | facts, command)
+    world = next(iter(plan.engines.values())).title if args.walker else args.world
+    print_result(args.json, result, partial(_print_cells, cells, result["claims"], world))
+    if out is not None:
+        say(f"the report is {out / 'report.md'}")
+
+
+def _print_cells(cells: Cells, claims: Iterable[str], world: str) -> None:
+    """Print a table for each trajectory of one column; of several, the changes and the claims."""
+    if len({column for column, _ in cells}) > 1:
+        report.print_matrix(cells, claims)
+        return
+    for (_, trajectory), verdict in cells.items():
+        print_table(verdict, f"{trajectory}, {plural(len(verdict.seeds), 'plant')}", world)
+
+
+def _compare(args: Evaluate) -> None:
+    """Put finished runs side by side."""
+    names = (flag.name for flag in fields(args) if flag.name not in ("runs", "json", "config"))
+    if beside := [f"--{name.replace('_', '-')}" for name in names if args.is_given(name)]:
+        raise InputError(f"--runs compares what has walked already, so not beside {beside[0]}")
+    finished = [folder for folder in args.runs if (folder / RESULT).exists()]
+    for folder in args.runs:
+        if finished and folder not in finished:
+            say(f"{folder} is left out: it is not a finished run")
+    comparison = compare_runs([load_run(folder) for folder in finished or args.runs])
+    print_result(args.json, comparison, partial(print_comparison, comparison))
+
+
+def plan_of(args: Evaluate) -> EvaluationPlan:
+    """Make the plan of the flags, checked before any walk.
+
+    Raises:
+        InputError: one line with the flag or the file.
+    """
+    robot = load_robot(args.robot)
+    trajectories = {}
+    for name, text in arguments.trajectories_by_name(args.traj).items():
+        trajectory = arguments.load_trajectory(text, robot)
+        trajectories[name] = trajectory, arguments.walk_seconds(args, trajectory)
+    models = {OWN: PlantModel()}
+    for text in args.plant:
+        model = PlantModel(OTHER_MASSES[text]) if text in OTHER_MASSES else _model_of(text, robot)
+        name = text if model.plant is None else model.plant.description.name
+        if name in models:
+            raise InputError(f"--plant {text}: there is a model {name!r} already")
+        models[name] = model
+    engines, columns = _engines(args), {}
+    for column in (Column(engine, model) for engine in engines for model in models):
+        columns[column] = _seeds(args, args.other_seeds if columns else args.seeds)
+    cases = len(columns) * len(trajectories)
+    sets = _sets(args, robot, trajectories, paired=cases > 1 or args.out is not None)
+    return EvaluationPlan(robot, args.world, trajectories, sets, models, columns, engines)
+
+
+def _model_of(text: str, robot: Robot) -> PlantModel:
+    return PlantModel(plant=arguments.plant_of(Path(text), robot))
+
+
+def _engines(args: Evaluate) -> dict[str, Engine]:
+    if args.walker:
+        engine = arguments.engine_of(args)
+        return {engine.name: engine}
+    if "all" in args.engine:
+        return _installed()
+    return {name: choose_engine(name) for name in args.engine}
+
+
+def _seeds(args: Evaluate, count: int) -> range:
+    """Return the seeds of a column; a world without seeds is one plant."""
+    if args.world in ("ideal", "hfs"):
+        for name, only in (("seeds", 1), ("other_seeds", 1), ("first_seed", 0)):
             if args.is_given(name) and getattr(args, name) != only:
                 flag = f"--{name.replace('_', '-')} {getattr(args, name)}"
                 raise InputError(f"{flag}: --world {args.world} is one plant without a seed")
-        count = 1
-    seeds = range(args.first_seed, args.first_seed + count)
-    sets = {text: arguments.weights_by_name(text, robot) for text in args.weights}
-    plants = arguments.plants(args.world, seeds, (plant or robot).description)
-    config, engine = tunings.tune_config(robot), arguments.engine_of(args)
-    with workers(args.processes, args.cluster) as pool:
-        title = f"evaluating on {plural(count, 'plant')} of {args.world}"
-        walks = judging.judge(
-            Setup(pool, config, robot),
-            sets,
-            trajectory.command,
-            plants,
-            seeds,
-            title=title,
-            seconds=seconds,
-            plant=plant,
-            engine=engine,
-        )
-    verdict = metrics.make_verdict(config.loss, seeds, {trajectory.name: walks.scores})
-    title = f"{trajectory.name}, {plural(count, 'plant')}"
-    result = metrics.verdict_result(verdict, args.world) | {"engine": engine.name}
-    if plant is not None:
-        result["plant"] = plant.description.name
-        title += f" of {plant.description.name}"
-    if args.out is not None:
-        write_json(args.out, result)
-    names = arguments.short_names(args.weights)
-    scores = {names[text]: score for text, score in verdict.scores.items()}
-    world = engine.title if args.walker else args.world
-    print_text = partial(print_table, verdict._replace(scores=scores), title, world)
-    print_result(args.json, result, print_text)
+        return range(1)
+    if args.first_seed + count - 1 not in SEED:
+        raise InputError(f"seeds from {args.first_seed} on: the largest is {SEED.high}")
+    return range(args.first_seed, args.first_seed + count)
 
 
-def _check_world(args: Walk) -> None:
-    """Raise an InputError if a flag needs a world with a plant and there is none."""
-    if args.world != "srbm":
-        return
-    if args.plant is not None:
-        raise InputError("--plant needs a world of MuJoCo, got --world srbm")
-    if args.engine != "c" or args.walker:
-        flag = "--walker" if args.walker else f"--engine {args.engine}"
-        raise InputError(f"{flag} needs a world with a plant, got --world srbm")
+def _installed() -> dict[str, Engine]:
+    """Return the engines installed on this machine; say the reason for each missing engine."""
+    engines = {}
+    for name in get_args(WalkEngine):
+        try:
+            engines[name] = choose_engine(name)
+        except InputError as error:
+            say(f"left out: {error}")
+    return engines
 
 
-def run_walk(args: Walk) -> None:
-    """Walk once and report losses and errors.
+def _sets(
+    args: Evaluate, robot: Robot, trajectories: Iterable[str], *, paired: bool
+) -> dict[str, dict[str, Weights]]:
+    """Load the weight sets of each trajectory; a folder has one file per trajectory.
 
     Raises:
-        Broken: the solver failed on QPs of the walk.
+        InputError: a name is repeated; a file is not a weight set; or, where claims are made of
+            pairs, there is no other set beside nominal.
     """
-    if args.video is not None:
-        check_film(args.video)
-    robot = arguments.with_gait(load_robot(args.robot), args.gait)
-    plant = arguments.plant_of(args.plant, robot)
-    _check_world(args)
-    engine, weights = arguments.engine_of(args), arguments.weights_by_name(args.weights, robot)
-    command = arguments.load_trajectory(args.traj, robot)
-    loss, config = loss_of_robot(robot.description), walk_config(robot)
-    seconds = arguments.walk_seconds(args, command)
-    say("compiling (only the first time on a machine) and walking")
-    walk_with = partial(arguments.walk_once, args, robot, command, plant=plant, engine=engine)
-    trajectory = walk_with(weights)
-    score = metrics.score(loss, trajectory)
-    upright, fall = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen))), None
-    samples = round(config.gait.tick / float(trajectory.period))  # per plan
-    residuals = np.asarray(trajectory.residual)[::samples]
-    unsolved = int(np.sum(~(residuals <= SOLVED)))
-    fell = bool(score.fallen) and not unsolved  # without a plan, it is not due to the weights
-    if fell and args.world != "srbm" and not engine.differs:
-        fall = fall_of(config, robot, arguments.job_of(args, robot, command, weights, plant))
-    if args.out is not None and not args.walker:  # a program's own log is kept as it is
-        about = as_table(args) | {"walk": walk_card(*command[:2], weights, robot, seconds)}
-        save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=about)
-    where = args.world + ("" if engine is MUJOCO_C else f" in {engine.title}")
-    where += "" if plant is None else f" on {plant.description.name}"
-    title = f"{command.name} in {where}, {printable(args.weights)} weights"
-    result: dict[str, Any] = {
-        "engine": engine.name,
-        "seconds": upright if fall is None else fall.time,
-        "fell": fell,
-        **({} if fall is None else {"fall": fall._asdict()}),
-        **({} if plant is None else {"plant": plant.description.name}),
+    given = [named_file(text) for text in args.weights]
+    short = arguments.short_names([file for _, file in given])
+    paths: dict[str, Path] = {}
+    for name, file in ((name or short[file], file) for name, file in given):
+        if name in paths or (name in BASELINES and file != name):
+            raise InputError(f"--weights {file}: there is a set {name!r} already; use NAME={file}")
+        paths[name] = Path(file)
+    if paired and ("nominal" not in paths or len(paths) < 2):
+        raise InputError("--weights must be nominal, which changes are against, and other sets")
+
+    def load(path: Path, trajectory: str) -> Weights:
+        file = path / f"{trajectory}.json" if path.is_dir() else path
+        return arguments.weights_by_name(str(file), robot)
+
+    return {
+        trajectory: {name: load(path, trajectory) for name, path in paths.items()}
+        for trajectory in trajectories
     }
-    result |= {part: float(value) for part, value in score.losses.items()}
-    # the errors of a walk that falls at once are NaN
-    result |= {name: getattr(score, name).tolist() for name in ("rms_position", "rms_euler")}
-    result |= {"plans": len(residuals), "unsolved": unsolved, "residual": float(score.residual)}
-    print_result(args.json, result, partial(_print_walk, title, result, score, loss, fall))
-    if unsolved:
-        raise Broken(
-            f"{unsolved} of {plural(len(residuals), 'QP')} were not solved (largest relative "
-            f"residual {score.residual:.0e}, expected at most {SOLVED:.0e}): this walk is no result"
-        )
-    if args.video is not None:
-        name = Path(args.weights).stem
-        baseline = "expert" if name == "nominal" else "nominal"
-        say(f"walking with {baseline} weights for the other half of the film")
-        other = arguments.engine_of(replace(args, out=None))  # the log is that of the asked walk
-        before = walk_with(arguments.weights_by_name(baseline, robot), engine=other)
-        walks = {baseline: before, name: trajectory}
-        pictures.film(args.video, plant or robot, walks)
 
 
-def _print_walk(
-    text: str, result: dict[str, Any], score: metrics.Score, loss: Loss, fall: Fall | None
-) -> None:
-    end = "fell after" if result["fell"] else "ended after" if score.fallen else "walked"
-    end = f"{end} {result['seconds']:.2f} s" if fall is None else str(fall)
-    terms = ", ".join(f"{term.name} {score.losses[term.name]:.4g} {term.unit}" for term in loss)
-    print(f"{text}: {end}; L {score.L / 1e6:.3f}e6 ({terms})")
-    if result["seconds"] > 0.0:
-        x, y, z = 100 * score.rms_position
-        roll, pitch, yaw = np.degrees(score.rms_euler)
-        print(f"RMS error: x {x:.1f}, y {y:.1f}, z {z:.1f} cm; ", end="")
-        print(f"roll {roll:.1f}, pitch {pitch:.1f}, yaw {yaw:.1f} degrees")
+def _plan_text(plan: EvaluationPlan) -> str:
+    """Describe the number of walks, the plants, and the differences between engines."""
+    per_plant = sum(map(len, plan.sets.values()))
+    walks = plural(per_plant * sum(map(len, plan.columns.values())), "walk")
+    texts = [f"{report.title_of(column)} ({len(seeds)})" for column, seeds in plan.columns.items()]
+    parts = [f"{walks}: {per_plant} on each plant", f"plants: {', '.join(texts)}"]
+    parts += [f"in {plan.engines[name].title} {text}" for name, text in plan.differs.items()]
+    return "; ".join(parts)
 
 
-def run_grfm(args: Grfm) -> None:
-    """Report the prediction errors of each net, with pictures."""
-    robot, config = load_robot(), TuneConfig()
-    make_folder(args.out)
-    with workers(args.processes, args.cluster) as pool:
-        net = nets.load_or_train(pool, robot, args.data)
-        paper = nets.load_or_train(pool, robot, args.data, "paper")
-        with say_if_slow("reading the walks that no training saw"):
-            worlds = {"hfs": nets.held_out_walks(robot, net)}
-        if args.seeds:
-            worlds["standin"] = _on_stand_in(Setup(pool, config, robot), args.seeds)
-    effects = {
-        "raw": last_command,
-        "linear": as_effect(net.linear),
-        "paper": as_effect(paper.params),
-        "residual": as_effect(net.params),
-        "gated": as_effect(net.params.linear),
-    }
-    result, drifts = {}, {}
-    with bar("predicting the ground forces of the walks") as report_progress:
-        for done, (world, walks) in enumerate(worlds.items()):
-            report_progress(3 * done, 3 * len(worlds), f"{world}: errors")
-            start, push = walks.job.start_tick, walks.job.push
-            samples, _ = make_dataset(robot, walks.trajectory, start, push=push)
-            errors = training.errors_by_phi(effects, samples)
-            report_progress(3 * done + 1, 3 * len(worlds), f"{world}: errors by phase")
-            phases = fidelity.by_phase(effects, samples)
-            report_progress(3 * done + 2, 3 * len(worlds), f"{world}: open loop")
-            unpushed = ~np.any(push.force, axis=(1, 2))  # no model contains external pushes
-            calm = jax.tree.map(lambda x, unpushed=unpushed: x[unpushed], walks)
-            drifts[world] = {
-                name: fidelity.drift(robot, effect, calm.trajectory, calm.job.start_tick)
-                for name, effect in {**effects, "measured": None}.items()
-            }
-            result[world] = fidelity.as_result(errors, phases, drifts[world])
-    first = jax.tree.map(lambda x: x[0], worlds["hfs"].trajectory)
-    curves = fidelity.curves(robot, first, effects)
-    trainings = {"training": net.history, "training_paper": paper.history}
-    tick = config.rollout.walk.gait.tick
-    drawings = pictures.of_nets(args.out, tick, curves, drifts, trainings)
-    report = fidelity.write_net_report(args.out, result, drawings)
-    print_text = partial(arguments.print_errors, result["hfs"]["errors"])
-    print_result(args.json, {"report": str(report), "worlds": result}, print_text)
-    say(f"the report is {report}")
+def walk_cells(setup: Setup, plan: EvaluationPlan, folder: Path | None) -> Cells:
+    """Do all walks, engine by engine; walks whose scores are in the folder are not repeated."""
+    scored = {}
+    for name, engine in plan.engines.items():
+        options = {"title": f"walking in {engine.title}", "folder": folder, "engine": engine}
+        scored |= judging.score_jobs(setup, _jobs(plan, name), **options)
+    cells = {}
+    for column, seeds in plan.columns.items():
+        for trajectory, sets in plan.sets.items():
+            case, where = (*column, trajectory), report.cell_text((column, trajectory))
+            walks = {name: [scored[*case, name, seed][0] for seed in seeds] for name in sets}
+            judging.say_faults({f"{name} on {where}": of_set for name, of_set in walks.items()})
+            scores = {name: [walk.score for walk in of_set] for name, of_set in walks.items()}
+            by_scene, loss = {trajectory: scores}, setup.config.loss
+            cells[column, trajectory] = metrics.make_verdict(loss, seeds, by_scene)
+    return cells
 
 
-def _on_stand_in(setup: Setup, count: int) -> Walks:
-    """Walk the three trajectories with nominal and expert weights, for information only."""
-    robot = setup.robot
-    jobs = [
-        Job(weights, named_command(name), plant, seed=seed)
-        for weights in (nominal(robot), expert(robot))
-        for name in COMMANDS
-        for seed, plant in enumerate(arguments.plants("standin", range(count), robot.description))
-    ]
-    title = f"walking on {plural(count, 'stand-in plant')}, for information"
-    walks = judging.walk_jobs(setup, jobs, title)
-    tick = setup.config.rollout.walk.gait.tick
-    return Walks(stack(jobs), stack([at_interval(walk, tick) for walk in walks]))
+def _jobs(plan: EvaluationPlan, engine: str) -> dict[judging.Case, Job]:
+    """Return the walks of an engine."""
+    jobs = {}
+    for column, seeds in plan.columns.items():
+        if column.engine != engine:
+            continue
+        model = plan.models[column.model]
+        body = (model.plant or plan.robot).description
+        for seed, drawn in zip(seeds, arguments.plants(plan.world, seeds, body), strict=True):
+            plant = drawn._replace(mass=model.mass * drawn.mass)
+            for trajectory, (command, seconds) in plan.trajectories.items():
+                for name, weights in plan.sets[trajectory].items():
+                    job = Job(weights, command.command, plant, seconds, seed, plant=model.plant)
+                    jobs[*column, trajectory, name, seed] = job
+    return jobs

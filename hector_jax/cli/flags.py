@@ -12,6 +12,7 @@ from hector_jax.core.settings import SEED, Range
 T = TypeVar("T")
 
 BASELINES = ("nominal", "expert")
+OTHER_MASSES = {"light": 0.9, "heavy": 1.1}  # models: the robot's own with all masses times this
 NAMED_WEIGHTS = (*BASELINES, "best")
 
 
@@ -26,6 +27,7 @@ class PathKind(Enum):
     WEIGHTS = "nominal, expert, best or a weights file"
     SETS = "nominal, expert, best, a weights file, or a folder of one for each trajectory"
     TRAJECTORY = "a name or a TOML file"
+    MODEL = "light, heavy or a TOML file of a robot"
     ROBOT = "a TOML file that names an MJCF: hector robot MODEL --out NAME.toml makes one"
 
 
@@ -36,6 +38,7 @@ def named_file(text: str) -> tuple[str, str]:
 
 
 Processes = Annotated[int, Range(1, 1024)]
+PROCESSES = 2
 Plants = Annotated[int, Range(1, 10_000)]
 Seed = Annotated[int, SEED]
 Seconds = Annotated[float, Range(0.01, 600)]  # at least one tick
@@ -47,9 +50,8 @@ Variant = Literal["residual", "paper"]
 OneEngine = Literal["c", "mjx", "drake", "pinocchio"]
 Engine = Literal["auto", OneEngine]
 WalkEngine = Literal["c", "drake", "pinocchio"]  # MJX has no plants with estimator errors
-JudgingEngine = Literal[WalkEngine, "all"]
+JudgingEngine = Literal[OneEngine, "all"]
 Gait = Literal["own", "walk", "trot", "pace", "crawl", "stand"]
-Family = Literal["standin", "even"]
 PlantWorld = Literal["ideal", "hfs", "hfs-varied", "hfs-even", "standin", "standin-even"]
 World = Literal["srbm", PlantWorld]
 RobotFile = Annotated[Path | None, PathKind.ROBOT]
@@ -103,7 +105,7 @@ class Configured(Flags):
 class Parallel(Flags):
     """A command that computes in several processes."""
 
-    processes: Processes = 2  # worker processes, one core each
+    processes: Processes = PROCESSES  # worker processes, one core each
     cluster: str | None = None  # HOST:PORT of a scheduler of dask, whose workers compute instead
 
 
@@ -131,7 +133,7 @@ class ByWalker(Flags):
 
 
 @_command
-class Collect(Configured, ForRobot, Parallel):
+class Collect(ForRobot, Parallel):
     """Walk on the high-fidelity simulator and record the measured ground forces.
 
     Example: hector steps collect --walks 128 --out data/more
@@ -145,7 +147,7 @@ class Collect(Configured, ForRobot, Parallel):
 
 
 @_command
-class Train(Configured, ForRobot, Printed):
+class Train(ForRobot, Printed):
     """Train GRFM-Net on collected walks.
 
     Example: hector steps train --data data/more --out data/more.npz
@@ -155,7 +157,6 @@ class Train(Configured, ForRobot, Printed):
     out: Path | None = None  # file for the net; by default beside DATA, grfm.npz for a tuning
     variant: Variant = "residual"  # architecture of the net
     epochs: Annotated[int, Range(1, 100_000)] = 200  # passes over the samples
-    seed: Seed = 0  # seed of the initial parameters and of the order of the samples
 
 
 @_command
@@ -179,7 +180,6 @@ class Tune(Configured, ByWalker, Parallel):
 
     usual = frozenset("traj start tune seeds smooth safe walks robot walker out resume".split())
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
-    each: bool = False  # tune the trajectories one by one, each in a run folder of its own
     start: Weights = "nominal"  # where to start: nominal, expert, best or a weights file
     # weights: Q and R; also footsteps, integral, all, or numbers by name;
     # `best` has the gains of the integral action and turn_lead in any case
@@ -194,11 +194,9 @@ class Tune(Configured, ByWalker, Parallel):
     safe: Annotated[float | None, Range(0.001, 10)] = None
     data: Folder = Path("data")  # folder of the walks and the net, which are made if missing
     net: Annotated[Path | None, PathKind.FILE] = None  # another net, instead of that in DATA
-    runs: Folder = Path("runs")  # the run folder is RUNS/TRAJ/TIME
-    out: Path | None = None  # the run folder itself, which must not exist (with --each: OUT/TRAJ)
+    out: Path | None = None  # the run folder, which must not exist; by default runs/TRAJ/TIME
     resume: Annotated[Path | None, PathKind.RUN] = None  # interrupted run folder to continue
     video: bool = True  # make a film of the nominal and the best weights
-    verdict: bool = False  # print up to 12 walks more: in other engines, or with other masses
     # walks to spend on row `best` after the choice of its start; 0 for none; by default four sets
     # walk on twelve drawn plants (docs/howto/walks.md)
     walks: Annotated[int | None, Range(0, 100_000)] = None
@@ -210,7 +208,7 @@ class Tune(Configured, ByWalker, Parallel):
 
 
 @_command
-class Propose(ForRobot, Parallel, Printed):
+class Propose(ForRobot, Printed):
     """Say which weights a robot, or a simulator elsewhere, is to walk with next.
 
     Example: hector propose runs/robot --traj s
@@ -224,7 +222,7 @@ class Propose(ForRobot, Parallel, Printed):
 
 
 @_command
-class Add(Parallel, Printed):
+class Add(Printed):
     """Take the logs of the walks with the weights that `hector propose` named.
 
     Example: hector log add runs/robot log.npz
@@ -238,43 +236,27 @@ class Add(Parallel, Printed):
 
 @_command
 class Evaluate(Configured, ForRobot, ByWalker, Parallel, Printed):
-    """Evaluate weight sets on the plants of a world and print a table.
+    """Compare weight sets on simulated robots, and say what may be claimed; or compare runs.
 
-    Example: hector evaluate --traj c --weights nominal expert mine.json
+    Example: hector evaluate --weights nominal expert with=runs/tuned --traj all --plant light heavy
     """
 
-    weights: tuple[Weights, ...] = BASELINES  # nominal, expert, best or weights files
-    traj: Trajectory = "straight"  # straight, c, s, sideways, turn, eight, stop-and-go or a file
-    world: PlantWorld = "standin"  # world of the plants; standin-even: masses drawn evenly
-    seconds: Seconds = 4.0  # length of each walk [s]; a whole eight takes 8
-    seeds: Plants = 8  # number of plants, in the worlds that have several
-    first_seed: Seed = 0  # first plant
-    out: Path | None = None  # file for the result as JSON
-    plant: RobotFile = None  # TOML file of another model of the robot, of which the plants are
-    gait: Gait = "own"  # that of the robot's file, walk, trot, pace, crawl or stand
-    engine: OneEngine = "c"  # c: MuJoCo; mjx: it knows its state exactly; extras: drake, pinocchio
-
-
-@_command
-class Verdict(Configured, ForRobot, ByWalker, Parallel, Printed):
-    """Evaluate weight sets in several engines and models, and say what may be claimed of them.
-
-    Example: hector verdict --weights nominal expert with=runs/tuned --light-heavy
-    """
-
+    usual = frozenset("weights runs traj world engine plant seeds robot out".split())
     # nominal, expert, best, weights files, folders of straight.json, c.json, ...; or NAME=one
     weights: tuple[WeightSets, ...] = BASELINES
-    traj: Trajectories = ("straight", "c", "s")  # trajectories: names or TOML files
-    engine: tuple[JudgingEngine, ...] = ("c",)  # c: MuJoCo; or all: every one that is installed
-    plant: tuple[Annotated[Path, PathKind.ROBOT], ...] = ()  # TOML files of models of the robot
-    light_heavy: bool = False  # also the robot's own model with masses times 0.9 and 1.1
-    family: Family = "standin"  # of the plants; even: masses drawn evenly about the nominal ones
-    seeds: Plants = 8  # number of plants of the robot's own model, in the first engine
-    model_seeds: Plants = 8  # number of plants of each other model, in the first engine
-    engine_seeds: Plants = 8  # number of plants of each model in each further engine
+    runs: tuple[Run, ...] = ()  # instead: finished runs of `hector tune`, side by side
+    traj: Trajectories = ("straight",)  # names (all: straight, c and s) or TOML files
+    world: PlantWorld = "standin"  # world of the plants; standin-even: masses drawn evenly
+    # c: MuJoCo; mjx: it knows its state exactly; extras: drake, pinocchio; all: the installed ones
+    engine: tuple[JudgingEngine, ...] = ("c",)
+    # other models of the robot: light and heavy (its masses times 0.9 and 1.1), TOML files
+    plant: tuple[Annotated[str, PathKind.MODEL], ...] = ()
+    seeds: Plants = 8  # number of plants of the first model, in the first engine
+    other_seeds: Plants = 8  # number of plants of each other model and engine
     first_seed: Seed = 0  # first plant
     seconds: Seconds = 4.0  # length of each walk [s]; a whole eight takes 8
-    out: Folder = Path("runs/verdict")  # folder for the report; a later call continues there
+    # folder for a report; a later call continues there
+    out: Annotated[Path | None, PathKind.FOLDER] = None
 
 
 @_command
@@ -348,8 +330,7 @@ class Export(Printed):
     run: Annotated[Path, PathKind.EXPORTABLE]  # run folder, `latest`, `best` or a weights file
     set: str = "best"  # weight set of the run
     out: Path | None = None  # folder; by default `export` in the run or beside the weights file
-    traj: Annotated[str | None, PathKind.TRAJECTORY] = None  # of the check; by default the run's
-    seconds: Seconds = 1.0  # length of that walk after the start-up [s]
+    seconds: Seconds = 1.0  # length of the walk of its check after the start-up [s]
     robot: RobotFile = None  # TOML file, with a weights file or --template; HECTOR by default
     # write no controller, but fill this file of numbers of another one: {{ Q.euler[0] }}, ..
     template: Annotated[Path | None, PathKind.FILE] = None
@@ -368,19 +349,6 @@ class View(Flags):
     world: World = "hfs"  # where both walk
     seed: Seed = 0  # seed of the plant and of the estimator's noise
     seconds: Annotated[float, Range(0.1, 600)] = 4.0  # length of each walk [s]
-    data: Path | None = None  # folder of the net that predicts the ground; by default the run's
     host: str = "127.0.0.1"  # address to listen on; the default admits only this machine
     port: Annotated[int, Range(0, 65535)] = 8080  # port; if it is in use, a free one is taken
-    headless: bool = False  # write a film and pictures instead of opening a page
-    out: Path | None = None  # folder for them (implies --headless); by default `view` in the run
-
-
-@_command
-class Compare(Printed):
-    """Compare finished runs: losses, falls, iterations, versions, settings.
-
-    Example: hector compare runs/straight/*
-    """
-
-    runs: tuple[Run, ...]  # folders of runs of `hector tune`, or `latest`
-    out: Path | None = None  # file for the comparison as JSON
+    out: Path | None = None  # folder for a film and pictures, in place of the page

@@ -18,7 +18,14 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from hector_jax.cli.flags import COMMANDS, NAMED_WEIGHTS, PathKind, named_file, with_given
+from hector_jax.cli.flags import (
+    COMMANDS,
+    NAMED_WEIGHTS,
+    OTHER_MASSES,
+    PathKind,
+    named_file,
+    with_given,
+)
 from hector_jax.core.console import say
 from hector_jax.core.inputs import InputError, check_file, did_you_mean, one_line, short_repr
 from hector_jax.core.settings import SEED, convert, from_table, read_json, read_toml, to_table
@@ -30,11 +37,7 @@ OVERVIEW = {
         "export": "write weights, lines for C++, the controller as C: hector export latest",
         "robot": "make the file of your own robot from its MJCF or URDF",
         "walk": "walk once; errors in cm and degrees, and a film with --video",
-        "evaluate": "compare weight sets on simulated robots",
-    },
-    "Compare": {
-        "verdict": "weight sets in several engines, and what may be claimed of them",
-        "compare": "finished runs side by side",
+        "evaluate": "compare weight sets on simulated robots and engines; or finished runs",
     },
     "Tune on the walks of a robot, or of a simulator elsewhere": {
         "log check": "what of the log of a walk no weights can mend",
@@ -76,7 +79,12 @@ def _command(words: Sequence[str]) -> str:
     word, two = words[0], " ".join(words[:2])
     if word in COMMANDS or two in COMMANDS:
         return word if word in COMMANDS else two
-    moved = {"report": "log add"} | {name.split()[-1]: name for name in COMMANDS if " " in name}
+    moved = {
+        "report": "log add",
+        "verdict": "evaluate --out runs/verdict",
+        "compare": "evaluate --runs",
+    }
+    moved |= {name.split()[-1]: name for name in COMMANDS if " " in name}
     hint = f"; it is `hector {moved[word]}` now" if word in moved else did_you_mean(two, COMMANDS)
     hint = hint or did_you_mean(word, COMMANDS) or f"; the commands are {', '.join(COMMANDS)}"
     raise InputError(f"unknown command {short_repr(two if word in _GROUPS else word)}{hint}")
@@ -335,6 +343,7 @@ def _check_source(label: str, value: Path | str, source: PathKind) -> None:
         PathKind.WEIGHTS: (named or path.suffix or os.path.lexists(path), not named),
         PathKind.SETS: (named or is_dir or path.suffix, not named and not is_dir),
         PathKind.TRAJECTORY: (True, path.suffix == ".toml"),
+        PathKind.MODEL: (text in OTHER_MASSES or path.suffix == ".toml", text not in OTHER_MASSES),
         PathKind.ROBOT: (path.suffix == ".toml", True),
     }[source]
     if not valid:

@@ -10,7 +10,7 @@ import numpy as np
 
 from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.arguments import print_result
-from hector_jax.cli.flags import Add, Propose, named_file
+from hector_jax.cli.flags import PROCESSES, Add, Propose, named_file
 from hector_jax.cli.parse import as_table, from_file
 from hector_jax.control.parameters import tunables
 from hector_jax.control.weights_file import load_weights
@@ -29,11 +29,11 @@ def run_propose(args: Propose) -> None:
     """Propose the next weights to walk with, the same ones until their walk is reported."""
     path = args.folder / CONFIG
     if path.exists():
-        call_flags = ("cluster", "folder", "json", "processes")
+        call_flags = ("folder", "json")
         args = run_folder.merge_flags(args.folder, from_file(Propose, path), args, call_flags)
     campaign = _campaign(args)
     make_folder(args.folder)
-    with locked(args.folder), workers(args.processes, args.cluster) as pool:
+    with locked(args.folder), workers(PROCESSES) as pool:
         found = reported_walks.read_reports(pool, campaign)
         if not path.exists():  # last, so that rejected flags can be corrected
             write_json(path, {"flags": as_table(args)})
@@ -63,7 +63,7 @@ def run_add(args: Add) -> None:
         return
     texts = list(map(str, args.logs))
     files = _files(texts, list(campaign.commands))
-    with locked(args.folder), workers(args.processes, args.cluster) as pool:
+    with locked(args.folder), workers(PROCESSES) as pool:
         number = reported_walks.read_reports(pool, campaign).number
         named = [name for name, _ in map(named_file, texts)]
         tracked = _check_logs(campaign, number, files, named)

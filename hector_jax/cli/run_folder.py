@@ -38,17 +38,17 @@ _CODE = (
     "walk_tuning.walks",
 )
 # flags of a call, not of the run that it begins or resumes
-_CALL_FLAGS = ("config", "each", "out", "resume", "runs")
+_CALL_FLAGS = ("config", "out", "resume")
 # flags that may change when a run is resumed
 _FREE_FLAGS = (
-    *("cluster", "data", "json", "processes", "verdict", "video"),
+    *("cluster", "data", "json", "processes", "video"),
     *("walker", "walker_limit", "walker_uses"),  # the record of its walks tells what it is
 )
 # flags that say nothing to a program of the user
-_OF_OUR_CONTROLLER = "alpha data iterations net safe smooth variant verdict".split()
+_OF_OUR_CONTROLLER = "alpha data iterations net safe smooth variant".split()
 
 
-def exists_error(folder: Path) -> InputError:
+def _exists_error(folder: Path) -> InputError:
     """Return the error for a run folder that exists."""
     return InputError(f"run folder {folder} exists; --resume continues it, --out names another")
 
@@ -61,7 +61,7 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
             them; --walk-engine is not installed; --safe beside a position limit; --tune names
             numbers that no gradient tunes; --net is not its net.
     """
-    loaded = arguments.load_trajectories(args.traj, robot, "; add --each")
+    loaded = arguments.load_trajectories(args.traj, robot)
     best_set.walk_plants(robot, args.walk_plants, args.walks, len(loaded))
     _check_walker(args)
     if args.net:
@@ -89,14 +89,15 @@ def _check_walker(args: Tune) -> None:
 
 def run_flags(args: Tune) -> Tune:
     """Return the flags of one run without its folders, which do not change the results."""
-    return replace(args, each=False, out=None, resume=None)
+    return replace(args, out=None, resume=None)
 
 
-def begin(folder: Path, args: Tune) -> Path:
+def begin(folder: Path, args: Tune) -> tuple[Path, Tune]:
     """Create the folder of a new run with its flags in one step, so that it can be resumed.
 
     Returns:
-        The folder; if its name was not set by a flag and exists, that of the next free second.
+        The folder; if its name was not set by a flag and exists, that of the next free second. And
+        the flags.
     """
     make_folder(folder.parent)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as part:
@@ -112,12 +113,12 @@ def begin(folder: Path, args: Tune) -> Path:
         write_json(new / CONFIG, config)
         while True:
             try:
-                return new.rename(folder)
+                return new.rename(folder), args
             except OSError as error:
                 if not folder.exists():
                     raise InputError(f"cannot write {folder}: {error.strerror}") from None
                 if args.out:
-                    raise exists_error(folder) from None
+                    raise _exists_error(folder) from None
             later = datetime.strptime(folder.name, TIME) + timedelta(seconds=1)
             folder = folder.with_name(f"{later:{TIME}}")
 
@@ -190,32 +191,16 @@ def note_settings(folder: Path, settings: dict[str, Any]) -> dict[str, Any]:
     return recorded | settings
 
 
-def by_folder(args: Tune, base: Path | None, robot: Robot) -> dict[Path, Tune]:
-    """Return the flags of each run by its folder.
-
-    Args:
-        args: flags of the command.
-        base: folder from a flag, if any.
-        robot: robot to tune.
+def of_flags(args: Tune) -> tuple[Path, Tune]:
+    """Return the folder of a new run and its flags, checked.
 
     Raises:
-        InputError: two trajectories have one name, or --resume lacks --each or should lack it.
+        InputError: one line with the flag that is wrong, or the folder exists.
     """
-    if args.resume:
-        single = sorted(path.parent for path in args.resume.glob(f"*/{CONFIG}"))
-        if single and not args.each:
-            raise InputError(f"{args.resume}: its trajectories were tuned one by one; add --each")
-        if args.each and not single:
-            raise InputError(f"{args.resume}: no runs of single trajectories; leave out --each")
-        if not args.is_given("traj"):  # those of the run
-            return dict.fromkeys(single if args.each else [args.resume], args)
-    names = arguments.trajectories_by_name(args.traj)
-    now = f"{datetime.now():{TIME}}"
-    parent = arguments.robot_folder(args.runs, args.robot, robot)
-    if args.each:
-        folders = {name: base / name if base else parent / name / now for name in names}
-        runs = {folders[name]: replace(args, traj=(text,)) for name, text in names.items()}
-    else:
-        folder = base or parent / "-".join(names) / now
-        runs = {folder: replace(args, traj=tuple(names.values()))}
-    return {folder: with_given(flags, args.given) for folder, flags in runs.items()}
+    robot, names = load_robot(args.robot), arguments.trajectories_by_name(args.traj)
+    flags = with_given(replace(args, traj=tuple(names.values())), args.given)
+    trajectories(flags, robot)
+    if args.out and args.out.exists():
+        raise _exists_error(args.out)
+    runs = arguments.robot_folder(Path("runs"), args.robot, robot)
+    return args.out or runs / "-".join(names) / f"{datetime.now():{TIME}}", flags

@@ -1,7 +1,7 @@
 """`hector tune`: tune weights with and without the net, evaluate them, and write a run folder."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -15,7 +15,6 @@ from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import BASELINES, Tune, Walk
 from hector_jax.cli.parse import as_command, latest_run
-from hector_jax.cli.verdict import small_verdict
 from hector_jax.cli.walker import tune_walker
 from hector_jax.control.parameters import step_names, tunables
 from hector_jax.control.reference import Command
@@ -54,26 +53,18 @@ _ARTEFACTS = "kept"  # folder in it
 
 
 def run_tune(args: Tune) -> None:
-    """Tune one weight set for all trajectories, or one for each, in new or resumed runs."""
+    """Tune one weight set for all trajectories, in a new or resumed run."""
     if args.out and args.resume:
         raise InputError(f"--out {args.out} and --resume {args.resume}: only one can be given")
     if args.video and not args.walker:
         check_film(Path("film.mp4"))
-    base, robot = args.resume or args.out, load_robot(args.robot)
-    runs = run_folder.by_folder(args, base, robot)
     if args.resume:
-        runs = {folder: run_folder.resume(folder, flags) for folder, flags in runs.items()}
+        folder, flags = args.resume, run_folder.resume(args.resume, args)
     else:
-        for folder, flags in runs.items():
-            run_folder.trajectories(flags, robot)
-            arguments.weights_by_name(flags.start, robot)
-            if base and folder.exists():
-                raise run_folder.exists_error(folder)
-        runs = {run_folder.begin(folder, flags): flags for folder, flags in runs.items()}
-    for folder, flags in runs.items():
-        with locked(folder):
-            say(f"the run folder is {folder}")
-            (tune_walker if flags.walker else _tune_in)(folder, flags)
+        folder, flags = run_folder.begin(*run_folder.of_flags(args))
+    with locked(folder):
+        say(f"the run folder is {folder}")
+        (tune_walker if flags.walker else _tune_in)(folder, flags)
 
 
 class _Run(NamedTuple):
@@ -163,10 +154,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
             run = _with_aligned_loss(run, norms["with"])
         settings = _note_settings(run, net)
         tuned = _tune_sets(run, net)
-        walks, elsewhere = _walk_sets(run, tuned.sets), folder / _ARTEFACTS / "elsewhere"
-        show = None
-        if args.verdict:
-            show = small_verdict(run.setup, tuned.sets, first, run.seconds, elsewhere)
+        walks = _walk_sets(run, tuned.sets)
     config, precision = run.setup.config, tuned.tunings["with"].precision
     known = determined(precision, config.ridge, step_names(run.start, config.others))
     result, by_name = _result(run, tuned, walks, known)
@@ -188,16 +176,11 @@ def _tune_in(folder: Path, args: Tune) -> None:
         environment=made_with,
         command=as_command("hector tune", run_folder.run_flags(args)),
     )
-    _print(run, result, by_name, show)
+    _print(run, result, by_name)
     say(f"the report is {report}")
 
 
-def _print(
-    run: _Run,
-    result: Mapping[str, Any],
-    by_name: Mapping[str, metrics.Verdict],
-    show_elsewhere: Callable[[], None] | None,
-) -> None:
+def _print(run: _Run, result: Mapping[str, Any], by_name: Mapping[str, metrics.Verdict]) -> None:
     """Print the result of a run."""
     newest = latest_run()
     text = "latest" if newest and newest.samefile(run.folder) else str(run.folder)
@@ -206,8 +189,6 @@ def _print(
         print(*first_lines(by_name[run.name], text), "", sep="\n")
         for name, verdict in by_name.items():
             print_table(verdict, f"{name}, {plural(run.args.seeds, 'plant')}")
-        if show_elsewhere:
-            show_elsewhere()
 
     print_result(run.args.json, {"run": str(run.folder), "traj": run.name, **result}, print_text)
 

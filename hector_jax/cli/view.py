@@ -24,9 +24,9 @@ from hector_jax.verdict import metrics
 
 def run_view(args: View) -> None:
     """Show a run on a page, or write its film and pictures."""
-    folder = args.out or (args.run / "view" if args.headless else None)
+    folder = args.out
     if folder is None:
-        require_package("viser", "view", "the page", " (--headless writes a film without it)")
+        require_package("viser", "view", "the page", " (--out writes a film without it)")
     else:
         check_film(folder / "film.mp4")
     request = read_request(args.run)
@@ -40,15 +40,15 @@ def run_view(args: View) -> None:
     if not args.is_given("sets") and not (args.run / "weights" / f"{after}.json").exists():
         after = "with"  # `best` is chosen at the end of a run
     sets = {name: weights_of(args.run, name, robot) for name in (before, after)}
-    data = arguments.data_folder(args.data or request.data, request.robot, robot)
-    net = request.net if args.data is None and request.net else nets.net_path(data, request.variant)
+    data = arguments.data_folder(request.data, request.robot, robot)
+    net = request.net or nets.net_path(data, request.variant)
     effects = {}
     params = load_net(net, robot, request.variant)[0] if net.exists() else None
-    if params is not None and (args.data or tree_hash(params) == request.params):
+    if params is not None and tree_hash(params) == request.params:
         effects["residual"] = as_effect(params)
     else:
         what = f"no net at {net}" if params is None else f"{net} is not the net of this run"
-        say(f"{what}, so its predictions are not shown; --data names another folder")
+        say(f"{what}, so its predictions are not shown")
 
     def walk() -> tuple[dict[str, view.ViewedWalk], str]:
         """Walk with both sets; return the walks and their description in Markdown."""

@@ -1,6 +1,6 @@
-"""The report of a verdict in several engines and models: a page, its numbers and a picture."""
+"""The report of an evaluation in several engines and models: a page, its numbers and a picture."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -42,13 +42,13 @@ def share_text(share: Interval) -> str:
     return f"{value} [{low}, {high}] %"
 
 
-def claims(cells: Cells, differs: Mapping[str, str], family: str) -> dict[str, list[str]]:
+def claims(cells: Cells, differs: Mapping[str, str], world: str) -> dict[str, list[str]]:
     """List the `claims` that the walks support, and their `limits`.
 
     Args:
         cells: the walks.
         differs: differences of the plants in an engine from those in MuJoCo C, by its name.
-        family: family of the plants.
+        world: world of the plants.
     """
     names = matrix.sets_of(cells)
     pairs = [(n, b) for n in names for b in BASELINES if b in names and b != n]
@@ -71,7 +71,7 @@ def claims(cells: Cells, differs: Mapping[str, str], family: str) -> dict[str, l
         models=list(dict.fromkeys(column.model for column in seeds)),
         few=[c for c, drawn in seeds.items() if len(drawn) < FEWEST],
         differs=differs,
-        family=family,
+        world=world,
         cell_text=cell_text,
         share_text=share_text,
         title_of=title_of,
@@ -103,8 +103,8 @@ def tables(cells: Cells) -> dict[str, str]:
     return {trajectory: markdown_table(head, lines, words=2) for trajectory, lines in rows.items()}
 
 
-def print_verdict(cells: Cells, differs: Mapping[str, str], family: str) -> None:
-    """Print the change of every set in every cell, and the claims."""
+def print_matrix(cells: Cells, lines: Iterable[str]) -> None:
+    """Print the change of every set in every cell, and the claims, a line each."""
     baseline = BASELINES[0]
     print(f"change of L against {baseline} in %, with falls where there are any")
     for cell, verdict in cells.items():
@@ -114,41 +114,36 @@ def print_verdict(cells: Cells, differs: Mapping[str, str], family: str) -> None
             text = change_text(compare(verdict, name, baseline), void=" *")
             texts.append(f"{name} {text}" + f" ({plural(falls, 'fall')})" * bool(falls))
         print(f"{cell_text(cell):32s} {'   '.join(texts)}")
-    for line in claims(cells, differs, family)["claims"]:
-        print(line)
+    print(*lines, sep="\n")
 
 
-def write_verdict_report(
-    folder: Path,
-    cells: Cells,
-    *,
-    family: str,
-    differs: Mapping[str, str],
-    config: Mapping[str, Any],
-    environment: Mapping[str, str],
-    command: str,
+def matrix_report(cells: Cells, differs: Mapping[str, str], world: str) -> dict[str, Any]:
+    """Return an evaluation as JSON values: `matrix_result`, the claims and their limits.
+
+    Args:
+        cells: the walks.
+        differs: differences of the plants in an engine from those in MuJoCo C, by its name.
+        world: world of the plants.
+    """
+    told = claims(cells, differs, world)
+    return matrix.matrix_result(cells, world) | {"differs": dict(differs), **told}
+
+
+def write_matrix_report(
+    folder: Path, cells: Cells, result: Mapping[str, Any], command: str
 ) -> dict[str, Any]:
     """Write report.md, verdict.json and verdict.png; return the content of verdict.json.
 
     Args:
         folder: output folder.
         cells: the walks.
-        family: family of the plants.
-        differs: differences of the plants in an engine from those in MuJoCo C, by its name.
-        config: the flags, as JSON values.
-        environment: versions and machine.
-        command: command line that repeats the verdict.
+        result: their `matrix_report`, with the flags as `config` and the machine as `environment`.
+        command: command line that repeats the evaluation.
     """
-    contents = {
-        **claims(cells, differs, family),
-        "config": dict(config),
-        "environment": dict(environment),
-    }
-    result = matrix.matrix_result(cells, family) | {"differs": dict(differs), **contents}
     picture = Picture("verdict.png", plots.save_matrix(folder / "verdict.png", cells, title_of))
     text = render(
         "matrix.md.j2",
-        **contents,
+        **{name: result[name] for name in ("claims", "limits", "config", "environment")},
         pictures=[picture],
         tables=tables(cells),
         command=command,
@@ -157,6 +152,6 @@ def write_verdict_report(
         count=len(matrix.columns_of(cells)),
         walks=sum(len(v.scores) * v.walks for v in cells.values()),
     )
-    write_json(folder / "verdict.json", result)
+    write_json(folder / "verdict.json", dict(result))
     write_file(folder / "report.md", text.encode())
-    return result
+    return dict(result)

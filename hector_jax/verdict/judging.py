@@ -1,5 +1,6 @@
 """The step `judge`: walks of weight sets on plants, each score an artefact (cache.py)."""
 
+import re
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -100,7 +101,10 @@ def _file_name(setup: Setup, case: Case, job: Job, with_walk: bool, engine: Engi
     _, config, robot = setup
     parts = [engine.key, config.rollout.walk, repr(config.loss), robot, job]
     key = content_key(*parts, *([job.plant] if job.plant else []), code=(*engine.modules, *_CODE))
-    return "-".join(["walk" if with_walk else "score", *map(str, case), f"{key}.npz"])
+    labels = (
+        re.sub(r"[^\w.-]+", "_", str(label)) for label in case
+    )  # the key tells equal ones apart
+    return "-".join(["walk" if with_walk else "score", *labels, f"{key}.npz"])
 
 
 def say_faults(walks: Mapping[str, Sequence[ScoredWalk]]) -> None:

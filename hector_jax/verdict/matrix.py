@@ -20,7 +20,7 @@ import numpy as np
 from hector_jax.verdict import metrics
 from hector_jax.verdict.metrics import BASELINES, COVERAGE, Comparison, Interval, Verdict
 
-OWN, LIGHT, HEAVY = "own", "light", "heavy"  # models: the robot's file, and with other masses
+OWN = "own"  # the model of the robot's file
 FEWEST_SETS = 3  # for which Kendall's tau is computed
 
 
@@ -28,7 +28,7 @@ class Column(NamedTuple):
     """World in which all sets walk."""
 
     engine: str
-    model: str  # OWN, LIGHT, HEAVY or the name of another model of the robot
+    model: str  # OWN, or the name of another model of the robot
 
 
 Cells = Mapping[tuple[Column, str], Verdict]
@@ -193,7 +193,7 @@ def _losses_on_shared_seeds(verdicts: Sequence[Verdict]) -> list[dict[str, np.nd
     return [{name: score.L[at] for name, score in v.scores.items()} for v, at in inputs]
 
 
-def matrix_result(cells: Cells, family: str) -> dict[str, Any]:
+def matrix_result(cells: Cells, world: str) -> dict[str, Any]:
     """Return all columns as JSON values: the content of verdict.json.
 
     `columns` is a list of `engine`, `model`, `seeds` and `trajectories.<name>`, each as the `sets`
@@ -221,7 +221,12 @@ def matrix_result(cells: Cells, family: str) -> dict[str, Any]:
         }
         sets[name] = {**_plain(falls(cells, name)), "against": against}
     kendall = [_plain(agreement) for agreement in agreements(cells)]
-    return {"family": family, "columns": columns, "sets": sets, "kendall": kendall}
+    return {
+        "family": metrics.family_of(world),
+        "columns": columns,
+        "sets": sets,
+        "kendall": kendall,
+    }
 
 
 def _cell(verdict: Verdict) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pretend import call, instead, pretend_score, pretend_walk, refused
 
-from hector_jax.cli import verdict as command
+from hector_jax.cli import evaluate as command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.inputs import InputError
@@ -105,11 +105,12 @@ def test_the_report_has_a_page_its_numbers_and_a_picture(tmp_path, drawn):
     fell.scores["with"].losses["L"][:2] *= 20.0
     cells = {(c, t): cell(4) for c in (C, HEAVY, DRAKE) for t in ("straight", "s")}
     cells[HEAVY, "s"] = fell
-    facts = {"config": {}, "environment": {"python": "3"}, "command": "hector verdict"}
-    report.write_verdict_report(tmp_path, cells, family="even", differs={}, **facts)
+    facts = {"config": {}, "environment": {"python": "3"}}
+    result = report.matrix_report(cells, {}, "standin-even") | facts
+    report.write_matrix_report(tmp_path, cells, result, "hector evaluate")
     page = (tmp_path / "report.md").read_text()
     assert "72 walks: `nominal`, `expert`, `with`, on 2 trajectories in 3 columns." in page
-    for line in sum(report.claims(cells, {}, "even").values(), []):
+    for line in sum(report.claims(cells, {}, "standin-even").values(), []):
         assert f"- {line}\n" in page
     told = json.loads((tmp_path / "verdict.json").read_text())
     there, total = told["columns"][1]["trajectories"]["s"]["with"], told["sets"]["with"]
@@ -145,11 +146,11 @@ def walked(monkeypatch):
     return state
 
 
-def test_all_engines_and_models_walk_and_a_cut_verdict_goes_on(
+def test_all_engines_and_models_walk_and_a_cut_evaluation_goes_on(
     monkeypatch, tmp_path, capsys, walked
 ):
-    words = ("verdict", "--out", tmp_path, "--traj", "s", "--seeds", 2, "--model-seeds", 1)
-    words += ("--engine", "all", "--engine-seeds", 1, "--light-heavy", "--json")
+    words = ("evaluate", "--out", tmp_path, "--traj", "s", "--seeds", 2, "--other-seeds", 1)
+    words += ("--engine", "all", "--plant", "light", "heavy", "--json")
     walked.cut = 9
     assert call(monkeypatch, *words) == 130
     walked.cut = None
@@ -167,13 +168,13 @@ def test_all_engines_and_models_walk_and_a_cut_verdict_goes_on(
     assert len(walked.jobs) == 14
 
 
-def test_a_folder_has_a_file_for_each_trajectory_and_a_family_other_plants(
+def test_a_folder_has_a_file_for_each_trajectory_and_a_world_other_plants(
     monkeypatch, tmp_path, capsys, walked
 ):
     for name, weights in (("s", expert()), ("c", nominal())):
         save_weights(tmp_path / "sets" / f"{name}.json", weights)
-    words = "--weights", "nominal", f"mine={tmp_path / 'sets'}", "--family", "even", "--json"
-    words = "verdict", "--out", tmp_path / "out", "--traj", "s", "c", "--seeds", 1, *words
+    words = "--weights", "nominal", f"mine={tmp_path / 'sets'}", "--world", "standin-even", "--json"
+    words = "evaluate", "--out", tmp_path / "out", "--traj", "s", "c", "--seeds", 1, *words
     assert call(monkeypatch, *words) == 0
     told = json.loads(capsys.readouterr().out)
     s, c = (told["columns"][0]["trajectories"][name]["mine"] for name in ("s", "c"))
@@ -188,10 +189,10 @@ def test_a_folder_has_a_file_for_each_trajectory_and_a_family_other_plants(
     [
         ("--weights expert", "--weights must be nominal, which changes are against, and"),
         ("--weights nominal nominla", "got 'nominla'; did you mean 'nominal'?"),
-        ("--weights nominal a-b={file}", "'a-b' is no name of letters, digits and _"),
+        ("--weights nominal expert={file}", "there is a set 'expert' already; use NAME="),
         ("--weights nominal {folder}", "straight.json: cannot read"),
         ("--engine pinocchio", "Pinocchio is not installed"),
-        ("--first-seed 4294967293 --seeds 1 --light-heavy", "the largest is 4294967295"),
+        ("--first-seed 4294967293 --seeds 1 --plant heavy", "the largest is 4294967295"),
     ],
 )
 def test_wrong_input_is_one_line_before_anything_is_walked(
@@ -200,6 +201,6 @@ def test_wrong_input_is_one_line_before_anything_is_walked(
     file = tmp_path / "sets" / "c.json"
     save_weights(file, nominal())
     words = words.format(file=file, folder=file.parent).split()
-    assert fault in refused(monkeypatch, capsys, "verdict", "--out", tmp_path / "out", *words)
+    assert fault in refused(monkeypatch, capsys, "evaluate", "--out", tmp_path / "out", *words)
     assert walked.jobs == []
     assert not (tmp_path / "out").exists()
