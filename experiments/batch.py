@@ -154,8 +154,8 @@ def scores_on_hfs(
     """Return the score of each weight set on the high-fidelity simulator."""
     with workers(flags.processes) as pool:
         setup = Setup(pool, TuneConfig(), robot)
-        judgement = judging.judge(setup, sets, command, [hfs()], [0], title="on the hfs")
-    return {name: score for name, (score,) in judgement.scores.items()}
+        judged = judging.judge(setup, sets, {"": command}, [hfs()], [0], title="on the hfs")
+    return {name: judged.walks["", name, 0].score for name in sets}
 
 
 def million(x: Any) -> str:

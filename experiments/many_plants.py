@@ -182,20 +182,14 @@ def main() -> None:
             "start": start,
             "search": answer,
         }
-        judge = partial(judging.judge, Setup(pool, config, robot), sets, folder=folder / "scores")
-        scores = {
-            name: judge(command, plants, seeds, title=f"walking {name}").scores
-            for name, command in commands.items()
-        }
+        inputs, judged = (Setup(pool, config, robot), sets, commands), {}
+        for title, part in (("own", slice(count)), ("others", slice(count, None))):
+            options = {"title": f"walking on the {title} plants", "folder": folder / "scores"}
+            judged[title] = judging.judge(*inputs, plants[part], seeds[part], **options).verdict
     rows, numbers = [], {}
-    for title, part in (("own", slice(count)), ("others", slice(count, None))):
+    for title, verdict in judged.items():
         for name in sets:
-            each = [
-                metrics.make_verdict(
-                    config.loss, seeds[part], {traj: {n: of[n][part] for n in ("nominal", name)}}
-                )
-                for traj, of in scores.items()
-            ]
+            each = [verdict.of_scene(traj) for traj in commands]
             changes = [metrics.compare(v, name, "nominal").change["L"].text() for v in each]
             falls = sum(int(v.scores[name].fallen.sum()) for v in each)
             rows.append([title, name, *changes, str(falls)])

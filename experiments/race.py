@@ -153,16 +153,16 @@ def judge(setup: Setup, weights: Weights, flags: Flags) -> tuple[str, dict[str, 
     inputs = setup, {"nominal": nominal(setup.robot), TUNER: weights}
     options = {"title": "judging the tuner", "folder": flags.out / "scores"}
     engine, command = choose_engine(flags.engine), named_command(flags.traj)
-    scores = judging.judge(*inputs, command, plants, seeds, **options, engine=engine).scores
-    verdict = metrics.make_verdict(setup.config.loss, seeds, {flags.traj: scores})
-    falls = {name: sum(bool(score.fallen) for score in each) for name, each in scores.items()}
+    commands = {flags.traj: command}
+    verdict = judging.judge(*inputs, commands, plants, seeds, **options, engine=engine).verdict
+    falls = {name: int(score.fallen.sum()) for name, score in verdict.scores.items()}
     change = metrics.compare(verdict, TUNER, "nominal").change["L"].text()
     text = (
         f"On {flags.plants} other plants (hfs-varied from {flags.first_plant} on) the set of the "
         f"tuner has an L of {change} % against nominal, median with 95 % interval; it fell "
         f"{falls[TUNER]} times, nominal {falls['nominal']}."
     )
-    return text, {name: [float(score.L) for score in each] for name, each in scores.items()}
+    return text, {name: score.L[:, 0].tolist() for name, score in verdict.scores.items()}
 
 
 def entry(losses: Float[np.ndarray, "seeds walks"]) -> dict[str, Any]:

@@ -81,10 +81,10 @@ def walk_robot(flags: Flags, pool: Executor, name: str, file: Path | None) -> Lo
         compared |= {
             f"{key}-{ridge:g}": w for (key, ridge), w in sets.items() if key in (command, "all")
         }
-        inputs = setup, compared, named_command(command), plants, seeds
+        inputs = setup, compared, {command: named_command(command)}, plants, seeds
         options = {"title": f"{name}: walking {command}", "folder": flags.out / "scores" / name}
-        scores = judging.judge(*inputs, **options).scores
-        losses[command] = {key: [float(s.L) for s in rows] for key, rows in scores.items()}
+        scores = judging.judge(*inputs, **options).verdict.scores
+        losses[command] = {key: score.L[:, 0].tolist() for key, score in scores.items()}
     return losses
 
 

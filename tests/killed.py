@@ -74,7 +74,7 @@ def table(folder: Path) -> None:
         sets["without"] = tuned["without"].weights
         seeds = range(WALKS // 2)
         plants = [hfs()] * len(seeds)
-        judging.judge(setup, sets, S, plants, seeds, title="", folder=folder / "s")
+        judging.judge(setup, sets, {"s": S}, plants, seeds, title="", folder=folder / "s")
 
 
 JOBS = {job.__name__: job for job in (collection, table)}

@@ -205,7 +205,7 @@ def test_a_plant_of_other_joints_is_refused(engine):
 def test_scores_of_another_plant_are_others(monkeypatch, tmp_path, arms):
     walks_of = lambda setup, jobs, *others: (pretend_walk(job.seed) for job in jobs)  # noqa: E731
     instead(monkeypatch, judging, "walk_jobs", walks_of)
-    known = {"nominal": nominal()}, named_command("straight"), [hfs()], [0]
+    known = {"nominal": nominal()}, {"straight": named_command("straight")}, [hfs()], [0]
     # another file with the very same numbers
     renamed = arms._replace(description=replace(arms.description, name="other"))
     with ThreadPoolExecutor(1) as pool:

@@ -63,7 +63,7 @@ def walked(monkeypatch):
 
 def judge(folder, sets, seeds=(0, 1, 2), plant=hfs):
     plants = [plant()] * len(seeds)
-    return judging.judge(SETUP, sets, S, plants, seeds, title="", folder=folder)
+    return judging.judge(SETUP, sets, {"s": S}, plants, seeds, title="", folder=folder)
 
 
 def test_a_tuning_comes_back_as_it_was_and_is_made_again_for_another_problem(tmp_path, tuned):
@@ -101,8 +101,8 @@ def test_metrics_of_a_run_that_was_cut_are_those_of_an_uncut_one(tmp_path, tuned
 def test_walks_that_are_kept_are_not_walked_again(tmp_path, walked):
     first, second = judge(tmp_path, SETS), judge(tmp_path, SETS)
     assert len(walked) == 6
-    same([w[:3] for w in first.walks["expert"]], [w[:3] for w in second.walks["expert"]])
-    same(first.first, second.first)
+    same(*([w[:3] for w in one.walks.values()] for one in (first, second)))
+    same(first.first("s"), second.first("s"))
     judge(tmp_path, SETS | {"mine": nominal()}, seeds=(0, 1, 2, 3))
     assert sorted(walked[6:]) == [0, 1, 2, 3, 3, 3]
     judge(tmp_path, {"nominal": expert()})
@@ -112,7 +112,7 @@ def test_walks_that_are_kept_are_not_walked_again(tmp_path, walked):
 
 def test_a_fall_is_kept_and_a_walk_with_an_unsolved_qp_is_said(tmp_path, walked, capsys):
     for _ in range(2):  # as walked, and as kept
-        walk = judge(tmp_path, {"mine": nominal()}, seeds=(0, 2, 4)).walks["mine"][1]
+        walk = judge(tmp_path, {"mine": nominal()}, seeds=(0, 2, 4)).walks["s", "mine", 2]
         assert walk.score.fallen
         assert float(walk.upright) == pytest.approx(0.5)
         assert np.isfinite(np.concatenate(walk.last)).all()

@@ -135,7 +135,7 @@ def test_a_fourth_term_is_tuned_told_and_written_from_one_place():
     assert as_row("mine", first)["L_sway"] == pytest.approx(float(terms["L_sway"]))
     walks = [metrics.score(loss, pretend_walk())] * 2
     verdict = metrics.make_verdict(loss, [0, 1], {"s": {"nominal": walks, "mine": walks}})
-    result = metrics.verdict_result(verdict)
+    result = metrics.verdict_result({"standin": verdict})
     assert result["alpha"]["L_sway"] == 1e4
     assert result["sets"]["mine"]["standin"]["L_sway"]["mean"] == walks[0].losses["L_sway"]
     assert "L_sway [m^2/s^2]" in render("verdict.md.j2", verdict=verdict)

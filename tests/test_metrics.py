@@ -57,7 +57,9 @@ def test_fewer_than_six_plants_have_no_interval():
             assert found.value == (count + 1) / 2
             assert np.isnan([found.low, found.high]).all()
     verdict = _judge(nominal=[1.0], tuned=[0.5])
-    found = json.loads(as_json(metrics.verdict_result(verdict)))["sets"]["tuned"]["standin"]
+    found = json.loads(as_json(metrics.verdict_result({"standin": verdict})))["sets"]["tuned"][
+        "standin"
+    ]
     assert found["L"] == {"mean": 0.5, "low": None, "high": None}
     change = found["change"]["nominal"]
     assert (change["median"], change["low"], change["high"]) == (pytest.approx(-50.0), None, None)
@@ -103,7 +105,7 @@ def test_a_comparison_counts_only_where_falls_differ_by_less_than_2_of_32_walks(
 def test_the_result_has_the_promised_keys_and_counts_plants_but_falls_and_wins_of_walks():
     scenes = ("straight", "c", "s")
     verdict = pretend_verdict(8, {("with", 1)}, scenes=scenes)
-    result = json.loads(json.dumps(metrics.verdict_result(verdict), allow_nan=False))
+    result = json.loads(json.dumps(metrics.verdict_result({"standin": verdict}), allow_nan=False))
     assert tuple(result["sets"]) == SETS
     for name, worlds in result["sets"].items():
         found = worlds["standin"]
@@ -126,7 +128,7 @@ def test_legs_that_touch_are_counted_up_to_a_fall():
     one = metrics.score(PAPER_LOSS, walk)
     assert one.legs_touch == pytest.approx(0.5)
     verdict = metrics.make_verdict(PAPER_LOSS, [0, 1], {"s": {"with": [one, one]}})
-    found = metrics.verdict_result(verdict)["sets"]["with"]["standin"]
+    found = metrics.verdict_result({"standin": verdict})["sets"]["with"]["standin"]
     assert found["legs_touch"] == pytest.approx(1.0)
 
 

@@ -11,7 +11,7 @@ from hector_jax.control.parameters import bounds
 from hector_jax.control.weights import nominal
 from hector_jax.core.environment import environment
 from hector_jax.report import report
-from hector_jax.report.report import Picture, print_table
+from hector_jax.report.report import Picture, print_tables
 from hector_jax.report.run import write_run_report
 from hector_jax.tuning.curvature import Determined, Direction
 from hector_jax.tuning.status import StepStatus, Stop
@@ -20,7 +20,7 @@ from hector_jax.walk_tuning.walks import WalkedSet, WalkTuning
 
 def printed(verdict, **options):
     out = io.StringIO()
-    print_table(verdict, "straight", console=Console(file=out, **options))
+    print_tables(verdict, console=Console(file=out, **options))
     return out.getvalue()
 
 

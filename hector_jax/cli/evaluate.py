@@ -21,15 +21,15 @@ from hector_jax.core.runtime import workers
 from hector_jax.core.settings import SEED
 from hector_jax.report import matrix as report
 from hector_jax.report.compare import compare_runs, print_comparison
-from hector_jax.report.report import print_table
+from hector_jax.report.report import print_tables
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.sim.engine import Engine, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.store import tunings
 from hector_jax.store.folder import RESULT, load_run
 from hector_jax.store.setup import Setup
-from hector_jax.verdict import judging, metrics
-from hector_jax.verdict.matrix import OWN, Cells, Column
+from hector_jax.verdict import judging
+from hector_jax.verdict.matrix import OWN, Column, Columns, cells_of
 
 
 class PlantModel(NamedTuple):
@@ -67,25 +67,20 @@ def run_evaluate(args: Evaluate) -> None:
     with nullcontext() if out is None else locked(out):
         with workers(args.processes, args.cluster) as pool:
             setup = Setup(pool, tunings.tune_config(plan.robot), plan.robot)
-            cells = walk_cells(setup, plan, out / "scores" if out else None)
+            columns = _walk(setup, plan, out / "scores" if out else None)
+        cells = cells_of(columns)
         result = report.matrix_report(cells, plan.differs, plan.world)
         if out is not None:
             facts = {"config": {"flags": as_table(args)}, "environment": made_with}
             command = as_command("hector evaluate", args)
             result = report.write_matrix_report(out, cells, result | facts, command)
     world = next(iter(plan.engines.values())).title if args.walker else args.world
-    print_result(args.json, result, partial(_print_cells, cells, result["claims"], world))
+    print_text = partial(report.print_matrix, cells, result["claims"])
+    if len(columns) == 1:
+        print_text = partial(print_tables, *columns.values(), world)
+    print_result(args.json, result, print_text)
     if out is not None:
         say(f"the report is {out / 'report.md'}")
-
-
-def _print_cells(cells: Cells, claims: Iterable[str], world: str) -> None:
-    """Print a table for each trajectory of one column; of several, the changes and the claims."""
-    if len({column for column, _ in cells}) > 1:
-        report.print_matrix(cells, claims)
-        return
-    for (_, trajectory), verdict in cells.items():
-        print_table(verdict, f"{trajectory}, {plural(len(verdict.seeds), 'plant')}", world)
 
 
 def _compare(args: Evaluate) -> None:
@@ -203,36 +198,28 @@ def _plan_text(plan: EvaluationPlan) -> str:
     return "; ".join(parts)
 
 
-def walk_cells(setup: Setup, plan: EvaluationPlan, folder: Path | None) -> Cells:
-    """Do all walks, engine by engine; walks whose scores are in the folder are not repeated."""
-    scored = {}
-    for name, engine in plan.engines.items():
-        options = {"title": f"walking in {engine.title}", "folder": folder, "engine": engine}
-        scored |= judging.score_jobs(setup, _jobs(plan, name), **options)
-    cells = {}
-    for column, seeds in plan.columns.items():
-        for trajectory, sets in plan.sets.items():
-            case, where = (*column, trajectory), report.cell_text((column, trajectory))
-            walks = {name: [scored[*case, name, seed][0] for seed in seeds] for name in sets}
-            judging.say_faults({f"{name} on {where}": of_set for name, of_set in walks.items()})
-            scores = {name: [walk.score for walk in of_set] for name, of_set in walks.items()}
-            by_scene, loss = {trajectory: scores}, setup.config.loss
-            cells[column, trajectory] = metrics.make_verdict(loss, seeds, by_scene)
-    return cells
+def _walk(setup: Setup, plan: EvaluationPlan, folder: Path | None) -> Columns:
+    """Do all walks, column by column; walks whose scores are in the folder are not repeated."""
+    return {
+        column: judging.judge_jobs(
+            setup,
+            _jobs(plan, column),
+            title=f"walking in {report.title_of(column)}",
+            folder=folder,
+            engine=plan.engines[column.engine],
+        ).verdict
+        for column in plan.columns
+    }
 
 
-def _jobs(plan: EvaluationPlan, engine: str) -> dict[judging.Case, Job]:
-    """Return the walks of an engine."""
-    jobs = {}
-    for column, seeds in plan.columns.items():
-        if column.engine != engine:
-            continue
-        model = plan.models[column.model]
-        body = (model.plant or plan.robot).description
-        for seed, drawn in zip(seeds, arguments.plants(plan.world, seeds, body), strict=True):
-            plant = drawn._replace(mass=model.mass * drawn.mass)
-            for trajectory, (command, seconds) in plan.trajectories.items():
-                for name, weights in plan.sets[trajectory].items():
-                    job = Job(weights, command.command, plant, seconds, seed, plant=model.plant)
-                    jobs[*column, trajectory, name, seed] = job
-    return jobs
+def _jobs(plan: EvaluationPlan, column: Column) -> dict[judging.Case, Job]:
+    """Return the walks of a column."""
+    seeds, model = plan.columns[column], plan.models[column.model]
+    drawn = arguments.plants(plan.world, seeds, (model.plant or plan.robot).description)
+    plants = [plant._replace(mass=model.mass * plant.mass) for plant in drawn]
+    return {
+        (name, of, seed): Job(w, command.command, plant, seconds, seed, plant=model.plant)
+        for name, (command, seconds) in plan.trajectories.items()
+        for seed, plant in zip(seeds, plants, strict=True)
+        for of, w in plan.sets[name].items()
+    }

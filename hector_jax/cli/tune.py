@@ -1,7 +1,7 @@
 """`hector tune`: tune weights with and without the net, evaluate them, and write a run folder."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -26,10 +26,11 @@ from hector_jax.core.environment import environment
 from hector_jax.core.files import locked, write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
+from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.network import as_effect
 from hector_jax.report import fidelity, pictures
-from hector_jax.report.report import Picture, first_lines, print_table
+from hector_jax.report.report import Picture, first_lines, print_tables
 from hector_jax.report.run import write_run_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
@@ -44,7 +45,7 @@ from hector_jax.tuning.curvature import Determined, determined
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.evaluate import aligned
 from hector_jax.verdict import judging, metrics
-from hector_jax.verdict.judging import ScoredWalks
+from hector_jax.verdict.judging import Judged
 from hector_jax.walk_tuning import best_set
 from hector_jax.walk_tuning.campaign import Campaign
 from hector_jax.walk_tuning.walks import WalkTuning, first_slope, tune_on_walks, with_best_start
@@ -154,16 +155,17 @@ def _tune_in(folder: Path, args: Tune) -> None:
             run = _with_aligned_loss(run, norms["with"])
         settings = _note_settings(run, net)
         tuned = _tune_sets(run, net)
-        walks = _walk_sets(run, tuned.sets)
+        standin, on_hfs = _walk_sets(run, tuned.sets)
     config, precision = run.setup.config, tuned.tunings["with"].precision
     known = determined(precision, config.ridge, step_names(run.start, config.others))
-    result, by_name = _result(run, tuned, walks, known)
+    worlds = {"standin": standin.verdict, "hfs": on_hfs.verdict}
+    result = _result(run, tuned, worlds, known)
     write_json(folder / VERSIONS, made_with | {"seconds": f"{time.monotonic() - start_time:.0f}"})
     report = write_run_report(
         folder,
         run=str(folder),
         trajectory=run.name,
-        verdict=by_name[run.name],
+        verdict=standin.verdict,
         norms=norms,
         determined=known,
         errors=net.errors,
@@ -171,24 +173,23 @@ def _tune_in(folder: Path, args: Tune) -> None:
         walks=tuned.walks,
         smooth=args.smooth,
         draws=best_set.DRAWS,
-        **_draw(run, tuned, *walks[first.name]),
+        **_draw(run, tuned, standin, on_hfs),
         config=settings,
         environment=made_with,
         command=as_command("hector tune", run_folder.run_flags(args)),
     )
-    _print(run, result, by_name)
+    _print(run, result, standin.verdict)
     say(f"the report is {report}")
 
 
-def _print(run: _Run, result: Mapping[str, Any], by_name: Mapping[str, metrics.Verdict]) -> None:
+def _print(run: _Run, result: Mapping[str, Any], verdict: metrics.Verdict) -> None:
     """Print the result of a run."""
     newest = latest_run()
     text = "latest" if newest and newest.samefile(run.folder) else str(run.folder)
 
     def print_text() -> None:
-        print(*first_lines(by_name[run.name], text), "", sep="\n")
-        for name, verdict in by_name.items():
-            print_table(verdict, f"{name}, {plural(run.args.seeds, 'plant')}")
+        print(*first_lines(verdict, text), "", sep="\n")
+        print_tables(verdict)
 
     print_result(run.args.json, {"run": str(run.folder), "traj": run.name, **result}, print_text)
 
@@ -208,8 +209,9 @@ def _check_start(run: _Run) -> None:
         InputError: the robot falls; the line has the likeliest cause and what to change.
     """
     setup, robot, text = run.setup, run.setup.robot, run.args.start
-    case, folder = (text if text in BASELINES else "start", 0), run.folder / _ARTEFACTS / "hfs"
+    folder, at = run.folder / _ARTEFACTS / "hfs", text if text in BASELINES else "start"
     for name, command in run.commands.items():
+        case = name, at, 0
         job = Job(run.start, command, hfs(robot.description), run.seconds)
         title = f"walking {name} with the weights to start from"
         walks = judging.score_jobs(setup, {case: job}, title=title, folder=folder, with_walk=[case])
@@ -277,28 +279,23 @@ def _campaign(run: _Run) -> tuple[Campaign, int]:
     return Campaign(*inputs, arguments.engine_of(args)), budget
 
 
-def _walk_sets(
-    run: _Run, sets: Mapping[str, Weights]
-) -> dict[str, tuple[ScoredWalks, ScoredWalks]]:
-    """Walk all sets on the stand-in plants and on the hfs; return the walks by trajectory."""
+def _walk_sets(run: _Run, sets: Mapping[str, Weights]) -> tuple[Judged, Judged]:
+    """Walk all sets on the stand-in plants, and on the hfs."""
     seeds, description = range(run.args.seeds), run.setup.robot.description
     plants = arguments.plants("standin", seeds, description)
-    judge = partial(judging.judge, run.setup, sets, seconds=run.seconds)
-    folder, simulator, walks = run.folder / _ARTEFACTS, hfs(description), {}
-    for name, command in run.commands.items():
-        suffix = f" {name}" if len(run.trajectories) > 1 else ""
-        title = f"evaluating{suffix} on {plural(len(seeds), 'stand-in plant')}"
-        standin = judge(command, plants, seeds, title=title, folder=folder / "standin")
-        title = f"walking{suffix} on the high-fidelity simulator"
-        on_hfs = judge(command, [simulator], [0], title=title, folder=folder / "hfs")
-        walks[name] = standin, on_hfs
-        _say_worse(name, on_hfs)
-    return walks
+    judge = partial(judging.judge, run.setup, sets, run.commands, seconds=run.seconds)
+    folder, title = run.folder / _ARTEFACTS, f"evaluating on {plural(len(seeds), 'stand-in plant')}"
+    standin = judge(plants, seeds, title=title, folder=folder / "standin")
+    title = "walking on the high-fidelity simulator"
+    on_hfs = judge([hfs(description)], [0], title=title, folder=folder / "hfs")
+    for name in run.commands:
+        _say_worse(name, on_hfs.verdict.of_scene(name))
+    return standin, on_hfs
 
 
-def _say_worse(name: str, on_hfs: ScoredWalks) -> None:
+def _say_worse(name: str, on_hfs: metrics.Verdict) -> None:
     """Report tuned sets that walk worse than the nominal weights."""
-    L = {set_name: float(scores[0].L) for set_name, scores in on_hfs.scores.items()}
+    L = {set_name: score.L.item() for set_name, score in on_hfs.scores.items()}
     for tuned in ("without", "with", "best"):
         if L.get(tuned, 0.0) > 1.05 * L["nominal"]:  # less says nothing, of one walk
             say(
@@ -308,60 +305,43 @@ def _say_worse(name: str, on_hfs: ScoredWalks) -> None:
 
 
 def _result(
-    run: _Run,
-    tuned: _Tuned,
-    walks: Mapping[str, tuple[ScoredWalks, ScoredWalks]],
-    known: Determined,
-) -> tuple[dict[str, Any], dict[str, metrics.Verdict]]:
-    """Write result.json; return its content and the verdicts, of all walks and by trajectory."""
-
-    def verdict(names: Sequence[str], world: int) -> metrics.Verdict:
-        scores, plants = {name: walks[name][world].scores for name in names}, (run.args.seeds, 1)
-        return metrics.make_verdict(run.setup.config.loss, range(plants[world]), scores)
-
-    def content(names: Sequence[str], standin: metrics.Verdict) -> dict[str, Any]:
-        result = metrics.verdict_result(standin)
-        for name, on_hfs in metrics.verdict_result(verdict(names, 1), "hfs")["sets"].items():
-            result["sets"][name] |= on_hfs
-        return result
-
-    names = list(walks)
-    by_name = {run.name: verdict(names, 0)}
-    result = content(names, by_name[run.name])
-    if len(names) > 1:
-        by_name |= {name: verdict([name], 0) for name in names}
-        result["trajectories"] = {name: content([name], by_name[name]) for name in names}
+    run: _Run, tuned: _Tuned, verdicts: Mapping[str, metrics.Verdict], known: Determined
+) -> dict[str, Any]:
+    """Write result.json, with the verdict in each world; return its content."""
+    result = metrics.verdict_result(verdicts)
     if tuned.walks:
         result["walks"] = tuned.walks.rows
     directions = [direction._asdict() for direction in known.directions]
     result["determined"] = {"directions": directions, "weights": known.weights}
     write_json(run.folder / RESULT, result)
-    return result, by_name
+    return result
 
 
-def _draw(run: _Run, tuned: _Tuned, standin: ScoredWalks, on_hfs: ScoredWalks) -> dict[str, Any]:
+def _draw(run: _Run, tuned: _Tuned, standin: Judged, on_hfs: Judged) -> dict[str, Any]:
     """Draw the pictures and the film of a run, for its report."""
     effects = {"linear": as_effect(tuned.net.linear), "residual": as_effect(tuned.net.params)}
+    name = run.trajectories[0].name
+    walks, on_simulator = standin.first(name), on_hfs.first(name)["nominal"]
     with ThreadPoolExecutor(1) as background:  # another process draws the film
-        film = background.submit(_film, run, standin)
-        curves = fidelity.curves(run.setup.robot, on_hfs.first["nominal"], effects)
+        film = background.submit(_film, run, walks)
+        curves = fidelity.curves(run.setup.robot, on_simulator, effects)
         drawings = pictures.of_run(
             run.folder,
             run.setup.config,
             sets=tuned.sets,
             tunings=tuned.tunings,
-            walks=standin.first,
+            walks=walks,
             ground=curves,
             training=tuned.net.history,
         )
     return {"pictures": drawings, "film": film.result()}
 
 
-def _film(run: _Run, walks: ScoredWalks) -> Picture | str:
+def _film(run: _Run, walks: Mapping[str, Trajectory]) -> Picture | str:
     """Make the film of a run; return the reason if there is none."""
     if not run.args.video:
         return "left out (--no-video)"
-    pair = {name: walks.first[name] for name in ("nominal", "best")}
+    pair = {name: walks[name] for name in ("nominal", "best")}
     film = [run.folder / f"film.{kind}" for kind in ("mp4", "png")]
     reason = pictures.film(film[0], run.setup.robot, pair, film[1])
     return reason or Picture("film.mp4", "Nominal and tuned weights on the first stand-in plant.")

@@ -1,7 +1,6 @@
 """A controller of the user: what the logs of its walks show, its twin, a tuning on its walks."""
 
 from collections.abc import Iterator, Mapping
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -18,7 +17,7 @@ from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
 from hector_jax.core.trajectory import FEET
-from hector_jax.report.report import first_lines, print_table
+from hector_jax.report.report import first_lines, print_tables
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.sim.log_check import check_log, read_check
 from hector_jax.sim.loop import Job
@@ -134,25 +133,18 @@ def tune_walker(folder: Path, args: Tune) -> None:
             save_weights(folder / "weights" / f"{name}.json", weights)
         seeds = range(args.seeds)
         drawn = arguments.plants("standin", seeds, robot.description)
-        judge = partial(judging.judge, setup, compared, plants=drawn, seeds=seeds, **options)
-        title = f"evaluating on {plural(len(seeds), 'plant')}"
-        scores = {n: judge(command=c, title=f"{title}, {n}").scores for n, c in commands.items()}
-    verdict = partial(metrics.make_verdict, config.loss, seeds)
-    whole, by_name = verdict(scores), {name: verdict({name: scores[name]}) for name in scores}
-    result = {
-        **metrics.verdict_result(whole),
-        "trajectories": {name: metrics.verdict_result(by_name[name]) for name in by_name},
-        "walks": tuned.rows,
-    }
+        title, inputs = f"evaluating on {plural(len(seeds), 'plant')}", (drawn, seeds)
+        judged = judging.judge(setup, compared, commands, *inputs, title=title, **options)
+    verdict = judged.verdict
+    result = {**metrics.verdict_result({"standin": verdict}), "walks": tuned.rows}
     write_json(folder / RESULT, result)
 
     def print_text() -> None:
-        print(*first_lines(whole, ""), "", sep="\n")
-        for name, of in ({", ".join(by_name): whole} | by_name).items():
-            print_table(of, f"{name}, {plural(len(seeds), 'plant')}", campaign.engine.title)
+        print(*first_lines(verdict, ""), "", sep="\n")
+        print_tables(verdict, campaign.engine.title)
 
     print_result(args.json, {"run": str(folder), **result}, print_text)
-    means = {n: np.mean([np.log(x.L) for of in scores.values() for x in of[n]]) for n in compared}
+    means = {name: np.log(verdict.scores[name].L).mean() for name in compared}
     if means["best"] >= means["start"]:
         say("on plants that were not walked `best` is no better than the start: keep that")
     say(f"the weights are {folder / 'weights' / 'best.json'}")

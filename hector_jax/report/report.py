@@ -163,23 +163,21 @@ def plain_console(console: Console | None, width: int) -> Console:
     return Console(file=console.file, highlight=False, width=width, color_system=None)
 
 
-def print_table(
-    verdict: Verdict, title: str = "", world: str = "standin", console: Console | None = None
-) -> None:
-    """Print the verdict as one table, without colours outside a terminal.
+def print_tables(verdict: Verdict, world: str = "standin", console: Console | None = None) -> None:
+    """Print the verdict as a table, and of several scenes each, without colours outside a terminal.
 
     Args:
         verdict: verdict to print.
-        title: title of the walks.
         world: world of the walks.
         console: output; None means stdout.
     """
     console = plain_console(console, width=160)
-    world = WORLDS.get(world, world)
-    console.print(Text(f"{title} on the {world}" if title else f"On the {world}", style="bold"))
-    console.print(_terminal_table(verdict, padding=1 if console.width >= 90 else 0))
-    for line in legend(verdict):
-        console.print(Text(line, style="dim"))
+    where = f"{plural(len(verdict.seeds), 'plant')} on the {WORLDS.get(world, world)}"
+    for name, one in verdict.each.items():
+        console.print(Text(f"{name}, {where}", style="bold"))
+        console.print(_terminal_table(one, padding=1 if console.width >= 90 else 0))
+        for line in legend(one):
+            console.print(Text(line, style="dim"))
 
 
 def _terminal_table(verdict: Verdict, padding: int) -> Table:

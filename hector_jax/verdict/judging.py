@@ -31,8 +31,8 @@ from hector_jax.verdict import metrics
 # modules that determine the numbers, for `content_key`
 _CODE = ("verdict.judging", "sim.diagnosis", "verdict.metrics")
 
-Case = tuple[str | int, ...]
-"""Labels of a walk, the last the seed of its plant."""
+Case = tuple[str, str, int]
+"""Trajectory, weight set and seed of the plant of a walk."""
 
 
 class ScoredWalk(NamedTuple):
@@ -44,16 +44,17 @@ class ScoredWalk(NamedTuple):
     startup: str  # description of a fall in the start-up; empty if there is none
 
 
-class ScoredWalks(NamedTuple):
-    """Walks of several sets on the same plants."""
+class Judged(NamedTuple):
+    """Walks of several sets on the same plants and trajectories."""
 
-    walks: dict[str, list[ScoredWalk]]  # by set, in the order of the plants
-    first: dict[str, Trajectory]  # by set, the walk on the first plant; empty if none is stored
+    walks: dict[Case, ScoredWalk]
+    verdict: metrics.Verdict
+    stored: dict[Case, Trajectory]  # the walks that are saved beside their scores
 
-    @property
-    def scores(self) -> dict[str, list[metrics.Score]]:
-        """Scores by set, in the order of the plants."""
-        return {name: [walk.score for walk in walks] for name, walks in self.walks.items()}
+    def first(self, trajectory: str) -> dict[str, Trajectory]:
+        """Return the stored walk of each set on a trajectory."""
+        found = self.stored.items()
+        return {name: walk for (scene, name, _), walk in found if scene == trajectory}
 
 
 def walk_jobs(
@@ -159,10 +160,36 @@ def score_jobs(
     return load_or_make(paths, make, like=like, kind="walk", robot=setup.robot)
 
 
+def judge_jobs(setup: Setup, jobs: Mapping[Case, Job], **options: Any) -> Judged:
+    """Walk every set on every trajectory and plant, score the walks and say their faults.
+
+    Args:
+        setup, options: see `score_jobs`.
+        jobs: a job for each trajectory, set and seed.
+    """
+    results = score_jobs(setup, jobs, **options)
+    walks = {case: walk for case, (walk, _) in results.items()}
+    scenes, names, seeds = (list(dict.fromkeys(labels)) for labels in zip(*jobs, strict=True))
+    groups = {
+        (scene, name): [walks[scene, name, seed] for seed in seeds]
+        for scene in scenes
+        for name in names
+    }
+    several = len(scenes) > 1
+    say_faults({f"{n} on {scene}" if several else n: w for (scene, n), w in groups.items()})
+    scores = {
+        scene: {name: [walk.score for walk in groups[scene, name]] for name in names}
+        for scene in scenes
+    }
+    verdict = metrics.make_verdict(setup.config.loss, seeds, scores)
+    stored = {case: walk for case, (_, walk) in results.items() if walk is not None}
+    return Judged(walks, verdict, stored)
+
+
 def judge(
     setup: Setup,
     sets: Mapping[str, Weights],
-    command: Command,
+    commands: Mapping[str, Command],
     plants: Sequence[Imperfections],
     seeds: Sequence[int],
     *,
@@ -171,17 +198,17 @@ def judge(
     folder: Path | None = None,
     plant: Robot | None = None,
     engine: Engine = MUJOCO_C,
-) -> ScoredWalks:
-    """Walk every weight set on every plant and score the walks.
+) -> Judged:
+    """Walk every weight set on every trajectory and plant, and score the walks.
 
     Args:
         setup: workers, controller and loss, nominal body.
         sets: weights by name.
-        command, seconds: command to walk, and length of the walks.
+        commands, seconds: command of each trajectory, and length of the walks.
         plants, seeds: plants, and the seeds of their estimators.
         title: title of the progress bar.
-        folder: folder of the scores; walks whose scores are in it are not repeated; None: nothing
-            is saved.
+        folder: folder of the scores, and of the walks on the first plant; walks whose scores are
+            in it are not repeated; None: nothing is saved.
         plant: another model of the robot, to which the plants belong.
         engine: engine of the walks.
 
@@ -189,14 +216,11 @@ def judge(
         InputError: the folder cannot be written, or the engine cannot walk a plant.
     """
     jobs = {
-        (name, seed): Job(weights, command, imperfections, seconds, seed, plant=plant)
+        (scene, name, seed): Job(weights, command, imperfections, seconds, seed, plant=plant)
+        for scene, command in commands.items()
         for imperfections, seed in zip(plants, seeds, strict=True)
         for name, weights in sets.items()
     }
-    first = [(name, seeds[0]) for name in sets] if folder else []
-    results = score_jobs(setup, jobs, title=title, folder=folder, engine=engine, with_walk=first)
-    by_set = {name: [results[name, seed][0] for seed in seeds] for name in sets}
-    say_faults(by_set)
-    firsts = ((name, results[name, seeds[0]][1]) for name in sets)
-    walks = {name: walk for name, walk in firsts if walk is not None}
-    return ScoredWalks(by_set, walks)
+    first = [case for case in jobs if case[2] == seeds[0]] if folder else []
+    options = {"title": title, "folder": folder, "engine": engine, "with_walk": first}
+    return judge_jobs(setup, jobs, **options)

@@ -31,6 +31,8 @@ class Column(NamedTuple):
     model: str  # OWN, or the name of another model of the robot
 
 
+Columns = Mapping[Column, Verdict]
+"""Walks of all sets on all trajectories, by column."""
 Cells = Mapping[tuple[Column, str], Verdict]
 """Walks of all sets, by column and trajectory."""
 
@@ -86,6 +88,11 @@ class Agreement(NamedTuple):
     one: Column
     other: Column
     tau: float  # Kendall's: 1 for the same order, -1 for the reverse one
+
+
+def cells_of(columns: Columns) -> Cells:
+    """Return the walks of each column on each trajectory."""
+    return {(c, t): verdict.of_scene(t) for c, verdict in columns.items() for t in verdict.scenes}
 
 
 def columns_of(cells: Cells) -> list[Column]:
@@ -232,8 +239,8 @@ def matrix_result(cells: Cells, world: str) -> dict[str, Any]:
 def _cell(verdict: Verdict) -> dict[str, Any]:
     """Return the sets of a verdict as JSON values."""
     sets = {}
-    for name, worlds in metrics.verdict_result(verdict)["sets"].items():
-        row, score = worlds["standin"], verdict.scores[name]
+    for name in verdict.scores:
+        row, score = metrics.set_result(verdict, name), verdict.scores[name]
         row["falls_share"] = fall_share(row["falls"], len(verdict.seeds))._asdict()
         row["fallen_by_seed"] = score.fallen[:, 0].tolist()
         row["L"] |= {"median": float(np.median(score.L)), "by_seed": score.L[:, 0].tolist()}

@@ -16,6 +16,7 @@ falls more often than the other by 2 of 32 walks or the same share.
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -81,6 +82,21 @@ class Verdict(NamedTuple):
     scenes: tuple[str, ...]  # names of the trajectories
     scores: dict[str, Score]  # by set, (plants, scenes) each
     loss: Loss
+
+    def of_scene(self, scene: str) -> "Verdict":
+        """Return the walks of one scene."""
+        at = [self.scenes.index(scene)]
+        scores = {
+            name: jax.tree.map(lambda x: np.take(x, at, axis=1), score)
+            for name, score in self.scores.items()
+        }
+        return self._replace(scenes=(scene,), scores=scores)
+
+    @property
+    def each(self) -> dict[str, "Verdict"]:
+        """The walks of all scenes by their names, and, of several, of each scene."""
+        several = self.scenes if len(self.scenes) > 1 else ()
+        return {", ".join(self.scenes): self, **{name: self.of_scene(name) for name in several}}
 
     @property
     def walks(self) -> int:
@@ -233,23 +249,32 @@ def family_of(world: str) -> str | None:
     return (family or name) if name == "standin" else None
 
 
-def verdict_result(verdict: Verdict, world: str = "standin") -> dict[str, Any]:
-    """Return the verdict as JSON values: the content of result.json.
+def verdict_result(verdicts: Mapping[str, Verdict]) -> dict[str, Any]:
+    """Return the verdict in each world as JSON values: the content of result.json.
 
-    `family` is that of the plants; results without this key are of the family `standin`.
     `sets.<name>.<world>.<part>.{mean,low,high}`, `.falls` of walks, `.seeds` of the plants,
     `.scenes`, `.legs_touch` [s, all walks together], `.L_ctrl_switching` and `.rms`, and
     `sets.<name>.<world>.change.<baseline>.{median,low,high,wins,counts}` in %, of L, with those of
-    the other parts under `.parts`.
+    the other parts under `.parts`; of several scenes, the same of each under `trajectories`.
     """
-    return {
-        "alpha": alphas(verdict.loss),
-        "family": family_of(world),
-        "sets": {name: {world: _set_result(verdict, name)} for name in verdict.scores},
+    first = next(iter(verdicts.values()))
+    result = {
+        "alpha": alphas(first.loss),
+        "sets": {
+            name: {world: set_result(verdict, name) for world, verdict in verdicts.items()}
+            for name in first.scores
+        },
     }
+    if len(first.scenes) > 1:
+        result["trajectories"] = {
+            scene: verdict_result({world: v.of_scene(scene) for world, v in verdicts.items()})
+            for scene in first.scenes
+        }
+    return result
 
 
-def _set_result(verdict: Verdict, name: str) -> dict[str, Any]:
+def set_result(verdict: Verdict, name: str) -> dict[str, Any]:
+    """Return the results of one set of a verdict as JSON values."""
     scores, summary = verdict.scores[name], summarize(verdict, name)
     euler, position = rms(verdict, name)
     return {
