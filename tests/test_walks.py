@@ -246,13 +246,14 @@ def test_a_tuning_begins_with_the_start_that_walks_best_and_repeats_none_of_its_
     aim = np.asarray(directions().T) @ np.linspace(-0.4, 0.2, 18)
     near, far = (as_weights(np.exp(x * aim) * NOMINAL) for x in (0.9, -2.0))
     starts = {"far": far, "near": near, "nominal": nominal()}
-    first = walks.with_best_start(Here(), toy(cases=5), starts)
+    name, first = walks.with_best_start(Here(), toy(cases=5), starts)
+    assert name == "near"
     assert same(first.start, walks.difftune.init(CONFIG, near).start)
     assert [case for case, _ in WALKED] == 3 * [0, 1, 2]
     found = walks.tune_on_walks(Here(), first, walks=10)
     assert [case for case, _ in WALKED[9:]] == [3, 4, 0, 1, 2, 3, 4]
     assert same(found.sets[0].weights, first.start)
-    again = walks.with_best_start(Here(), toy(cases=5), starts)
+    _, again = walks.with_best_start(Here(), toy(cases=5), starts)
     assert same(again.start, first.start)
     assert len(WALKED) == 16
 
@@ -261,7 +262,8 @@ def test_of_several_starts_one_that_falls_less_often_is_taken(monkeypatch, toy):
     losses = iter([np.inf, 1e6, 1e6, 2e6, 2e6, 1.5e6])
     monkeypatch.setattr(walks, "walk_case", lambda *_: walk_log.ScoredLog(next(losses), LOG))
     starts = {"falls": expert(), "stands": nominal()}
-    first = walks.with_best_start(Here(), toy(), starts)
+    name, first = walks.with_best_start(Here(), toy(), starts)
+    assert name == "stands"
     assert same(first.start, walks.difftune.init(CONFIG, nominal()).start)
 
 

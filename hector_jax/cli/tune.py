@@ -113,6 +113,7 @@ class _Tuned(NamedTuple):
     tunings: dict[str, Tuning]
     sets: dict[str, Weights]
     walks: WalkTuning | None  # whose result is `best`; None with --walks 0
+    begun: str  # name of the set that they began with
 
 
 def _begin(pool: Executor, folder: Path, args: Tune) -> _Run:
@@ -171,6 +172,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         errors=net.errors,
         tunings=tuned.tunings,
         walks=tuned.walks,
+        begun=tuned.begun,
         smooth=args.smooth,
         draws=best_set.DRAWS,
         **_draw(run, tuned, standin, on_hfs),
@@ -257,17 +259,17 @@ def _tune_sets(run: _Run, net: nets.TrainedNet) -> _Tuned:
     }
     for name, weights in sets.items():  # a tuning on walks may be long: these can be used meanwhile
         save_weights(run.folder / "weights" / f"{name}.json", weights)
-    (campaign, budget), walks = _campaign(run), None
+    (campaign, budget), walks, begun = _campaign(run), None, ""
     if budget:
         tuned = {name: sets[name] for name in ("best", "with", "without")}
         starts = {n: w._replace(others={**start.others, **w.others}) for n, w in tuned.items()}
-        campaign = with_best_start(setup.pool, campaign, starts | {"start": start})
+        begun, campaign = with_best_start(setup.pool, campaign, starts | {"start": start})
         walks = tune_on_walks(setup.pool, campaign, walks=budget)
         if not walks.sets[0].accepted:
             say(f"no steps on walks: {walks.reason}")
         sets["best"] = walks.sets[walks.best].weights
         save_weights(run.folder / "weights" / "best.json", sets["best"])
-    return _Tuned(net, done, sets, walks)
+    return _Tuned(net, done, sets, walks, begun)
 
 
 def _campaign(run: _Run) -> tuple[Campaign, int]:
@@ -310,7 +312,7 @@ def _result(
     """Write result.json, with the verdict in each world; return its content."""
     result = metrics.verdict_result(verdicts)
     if tuned.walks:
-        result["walks"] = tuned.walks.rows
+        result |= {"walks": tuned.walks.rows, "walks_begun_with": tuned.begun}
     directions = [direction._asdict() for direction in known.directions]
     result["determined"] = {"directions": directions, "weights": known.weights}
     write_json(run.folder / RESULT, result)

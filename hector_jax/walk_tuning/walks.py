@@ -141,8 +141,10 @@ def first_slope(campaign: Campaign) -> None:
 # The choice of the start
 
 
-def with_best_start(pool: Executor, campaign: Campaign, starts: Mapping[str, Weights]) -> Campaign:
-    """Return the campaign from that of several starts which walks best.
+def with_best_start(
+    pool: Executor, campaign: Campaign, starts: Mapping[str, Weights]
+) -> tuple[str, Campaign]:
+    """Return the name of that of several starts which walks best, and the campaign from it.
 
     Each walks on the first plants; of those that fall least often it is that with the least mean of
     log L, a fall bounded as in the tuning. Its walks are not made again.
@@ -164,10 +166,11 @@ def with_best_start(pool: Executor, campaign: Campaign, starts: Mapping[str, Wei
     losses = np.array(rows)
     means = _bounded_logs(losses, losses).mean(axis=1)
     best = tried[np.lexsort((means, (~np.isfinite(losses)).sum(axis=1)))[0]]
-    say(f"it begins with `{best.folder.name}`")
+    name = best.folder.name
+    say(f"it begins with `{name}`")
     for path, kept in zip(log_paths(best, 0), log_paths(campaign, 0), strict=False):
         write_file(kept, path.read_bytes())
-    return replace(campaign, start=best.start)
+    return name, replace(campaign, start=best.start)
 
 
 # The objective
