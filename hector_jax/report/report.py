@@ -26,6 +26,9 @@ from hector_jax.verdict.metrics import BASELINES, Comparison, Summary, Verdict
 # titles of worlds that differ from their names
 WORLDS = {"standin": "hardware stand-in", "standin-even": "hardware stand-in, family even"}
 VOID = "*"
+ERRORS = (
+    "Errors are RMS, up to a fall where there is one; in the plane: ahead and sideways together."
+)
 
 
 class Picture(NamedTuple):
@@ -176,19 +179,22 @@ def print_tables(verdict: Verdict, world: str = "standin", console: Console | No
     for name, one in verdict.each.items():
         console.print(Text(f"{name}, {where}", style="bold"))
         console.print(_terminal_table(one, padding=1 if console.width >= 90 else 0))
-        for line in legend(one):
+        for line in (ERRORS, *legend(one)):
             console.print(Text(line, style="dim"))
 
 
 def _terminal_table(verdict: Verdict, padding: int) -> Table:
     table = Table(box=box.SIMPLE_HEAD, padding=(0, padding, 0, 0), pad_edge=False, show_edge=False)
     table.add_column("set\n", no_wrap=True)
-    formats, others = columns(verdict).values(), baselines(verdict)
-    heads = [f"{form.part}\n{form.unit}" for form in formats]
-    for head in (*heads, "falls\n", *(f"against {baseline}\n[%]" for baseline in others)):
+    loss, others = columns(verdict)["L"], baselines(verdict)
+    errors = ("plane\n[cm]", "height\n[cm]", "pitch\n[deg]")
+    changes = (f"against {baseline}\n[%]" for baseline in others)
+    for head in (*errors, f"L\n{loss.unit}", "falls\n", *changes):
         table.add_column(head, justify="right", no_wrap=True)
     for name, summary in summaries(verdict).items():
-        means = [form.text(summary.means[form.part].value) for form in formats]
+        at = plain_errors(verdict, name)
+        means = [number(at[error], ".1f") for error in ("plane", "height", "pitch")]
+        means.append(loss.text(summary.means["L"].value))
         falls = Text(str(summary.falls), style="red" if summary.falls else "")
         changes = [_change(summary.against.get(baseline)) for baseline in others]
         table.add_row(name, *means, falls, *changes)
