@@ -85,13 +85,15 @@ def test_strider_is_tuned_by_the_same_command_and_a_run_knows_its_robot(
     monkeypatch.chdir(tmp_path)
     small = CollectConfig(walks=6, seconds=1.0)
     monkeypatch.setattr(nets, "CollectConfig", lambda: small)
-    flags = ("--traj", "straight", "--seeds", "1", "--iterations", "11", "--no-video")
-    assert call(monkeypatch, "tune", "--robot", STRIDER, *flags, "--processes", 1) == 0
+    Path("ahead.toml").write_text('name = "ahead"\n[[segment]]\nseconds = 1.5\nv_x = 0.3\n')
+    flags = ("--traj", "ahead.toml", "--seeds", "1", "--iterations", "4", "--no-video")
+    few = ("--walk-plants", "1", "--processes", "1")
+    assert call(monkeypatch, "tune", "--robot", STRIDER, *flags, *few) == 0
     assert len(load_walks(tmp_path / "data" / "strider" / "walks", strider).job.seed) == 6
     assert (tmp_path / "data" / "strider" / "grfm.npz").exists()
     with pytest.raises(ValueError, match="made for another robot"):
         load_walks(tmp_path / "data" / "strider" / "walks", load_robot())
-    (run,) = (tmp_path / "runs" / "strider" / "straight").iterdir()
+    (run,) = (tmp_path / "runs" / "strider" / "ahead").iterdir()
     assert find_weights(run, "with") == run / "weights" / "with.json"
     assert controller_of_run(run) == walk_config(strider)
     assert runs.read_request(run).robot == STRIDER
