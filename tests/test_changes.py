@@ -205,11 +205,12 @@ def test_a_plant_of_other_joints_is_refused(engine):
 def test_scores_of_another_plant_are_others(monkeypatch, tmp_path, arms):
     walks_of = lambda setup, jobs, *others: (pretend_walk(job.seed) for job in jobs)  # noqa: E731
     instead(monkeypatch, judging, "walk_jobs", walks_of)
-    known = {"nominal": nominal()}, {"straight": named_command("straight")}, [hfs()], [0]
+    job = Job(nominal(), named_command("straight"), hfs())
     # another file with the very same numbers
     renamed = arms._replace(description=replace(arms.description, name="other"))
     with ThreadPoolExecutor(1) as pool:
         for plant in (None, arms, arms, renamed):
             setup = Setup(pool, TuneConfig(), ROBOT)
-            judging.judge(setup, *known, title="", folder=tmp_path, plant=plant)
+            jobs = {("straight", "nominal", 0): job._replace(plant=plant)}
+            judging.judge_jobs(setup, jobs, title="", folder=tmp_path)
     assert len(list(tmp_path.glob("*.npz"))) == 3

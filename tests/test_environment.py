@@ -20,7 +20,7 @@ USUAL = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS
     [
         ("JAX_PLATFORMS=tpu", "walk", "JAX does not start with JAX_PLATFORMS=tpu: "),
         ("JAX_NUM_CPU_DEVICES=x", "walk", "JAX does not start with JAX_NUM_CPU_DEVICES=x: Invalid"),
-        ("MUJOCO_GL=crayon", "view . --headless", "MUJOCO_GL must be 'egl', 'osmesa', 'glfw' or"),
+        ("MUJOCO_GL=crayon", "view . --out shown", "MUJOCO_GL must be 'egl', 'osmesa', 'glfw' or"),
     ],
 )
 def test_what_does_not_work_with_the_environment_is_one_line(wrong, words, told):

@@ -180,8 +180,16 @@ def test_a_folder_has_a_file_for_each_trajectory_and_a_world_other_plants(
     s, c = (told["columns"][0]["trajectories"][name]["mine"] for name in ("s", "c"))
     assert s["change"]["nominal"]["median"] != 0.0
     assert c["change"]["nominal"]["median"] == 0.0
-    assert told["family"] == "even"
+    assert told["world"] == "standin-even"
     assert {float(job.imperfections.mass) for _, job in walked.jobs} == {float(even(0).mass)}
+
+
+def test_a_named_set_is_not_a_folder_of_that_name(monkeypatch, tmp_path, capsys, walked):
+    monkeypatch.chdir(tmp_path)
+    save_weights(tmp_path / "nominal" / "s.json", expert())
+    assert call(monkeypatch, "evaluate", "--traj", "s", "--seeds", 1, "--weights", "nominal") == 0
+    assert [float(job.weights.Q.euler[0]) for _, job in walked.jobs] == [nominal().Q.euler[0]]
+    assert capsys.readouterr().out.startswith("s, 1 plant on the hardware stand-in\n")
 
 
 @pytest.mark.parametrize(
@@ -191,7 +199,11 @@ def test_a_folder_has_a_file_for_each_trajectory_and_a_world_other_plants(
         ("--weights nominal nominla", "got 'nominla'; did you mean 'nominal'?"),
         ("--weights nominal expert={file}", "there is a set 'expert' already; use NAME="),
         ("--weights nominal {folder}", "straight.json: cannot read"),
+        ("--weights nominal .", "straight.json: cannot read"),
         ("--engine pinocchio", "Pinocchio is not installed"),
+        ("--engine all c", "--engine all stands alone, got all c"),
+        ("--plant light light", "--plant names 'light' twice"),
+        ("--runs {runs} --seeds 3", "--runs compares what has walked already, so not beside"),
         ("--first-seed 4294967293 --seeds 1 --plant heavy", "the largest is 4294967295"),
     ],
 )
@@ -200,7 +212,9 @@ def test_wrong_input_is_one_line_before_anything_is_walked(
 ):
     file = tmp_path / "sets" / "c.json"
     save_weights(file, nominal())
-    words = words.format(file=file, folder=file.parent).split()
+    runs = tmp_path / "runs"
+    runs.mkdir()
+    words = words.format(file=file, folder=file.parent, runs=runs).split()
     assert fault in refused(monkeypatch, capsys, "evaluate", "--out", tmp_path / "out", *words)
     assert walked.jobs == []
     assert not (tmp_path / "out").exists()

@@ -174,7 +174,7 @@ def test_the_report_tells_what_was_promised_and_what_is_particular_to_a_run(tmp_
         errors=errors(touchdown=[9.0, 4.0]),
         film=Picture("film.mp4", "Before and after."),
         walks=tuned_on_walks(),
-        begun="with",
+        begun_with="with",
     )
     for words in OF_WALKS.strip().splitlines():
         assert words in text

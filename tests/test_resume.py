@@ -311,7 +311,7 @@ def resume(*words, folder="run"):
 def begun(tmp_path, monkeypatch):
     """The folder of a run that was cut at once, in the working directory."""
     monkeypatch.chdir(tmp_path)
-    return run_folder.begin(tmp_path / "run", flags.Tune(out=tmp_path / "run", **OWN))[0]
+    return run_folder.begin(tmp_path / "run", flags.Tune(out=tmp_path / "run", **OWN))
 
 
 def test_what_changes_no_number_stays_as_it_was_unless_another_is_given(begun):
@@ -367,13 +367,22 @@ def test_a_run_of_another_trajectory_or_start_is_not_taken_up(begun, then, now, 
         run_folder.note_settings(begun, now)
 
 
+def test_all_is_what_a_run_of_all_was_begun_with(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "data").mkdir()
+    folder, args = run_folder.plan_run(flags.Tune(traj=("all",), out=Path("run")))
+    run_folder.begin(folder, args)
+    again = run_folder.resume(folder, flags.Tune(traj=("all",), resume=folder))
+    assert again.traj == ("straight", "c", "s")
+
+
 def test_runs_of_one_second_have_folders_of_their_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("mine.toml").write_text('name = "short"\n[[segment]]\nseconds = 2.0\nv_x = 0.2\n')
     folder, args = tmp_path / "20261121-235959", flags.Tune()
-    names = [run_folder.begin(folder, args)[0].name[-6:] for _ in range(3)]
+    names = [run_folder.begin(folder, args).name[-6:] for _ in range(3)]
     assert names == ["235959", "000000", "000001"]
-    new, given = run_folder.of_flags(flags.Tune(traj=("mine.toml",)))
+    new, given = run_folder.plan_run(flags.Tune(traj=("mine.toml",)))
     assert (new.parent, given.traj) == (Path("runs/short"), ("mine.toml",))
     with pytest.raises(InputError, match="of one length, got c 4 s, short 2 s"):
         command.run_tune(flags.Tune(traj=("c", "mine.toml")))

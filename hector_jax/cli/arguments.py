@@ -76,7 +76,7 @@ def short_names(texts: Sequence[str]) -> dict[str, str]:
     >>> short_names(["nominal", "runs/a/weights/with.json", "runs/b/other.json"])
     {'nominal': 'nominal', 'runs/a/weights/with.json': 'with', 'runs/b/other.json': 'other'}
     """
-    parts = {text: Path(text).with_suffix("").parts for text in texts}
+    parts = {text: Path(text.removesuffix(Path(text).suffix)).parts for text in texts}
     names = {}
     for text, path in parts.items():
         others = [other for other_text, other in parts.items() if other_text != text]

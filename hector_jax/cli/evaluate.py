@@ -1,15 +1,24 @@
 """`hector evaluate`: weight sets in engines and models of the robot, or finished runs."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple, get_args
 
+import numpy as np
+
 from hector_jax.cli import arguments
 from hector_jax.cli.arguments import print_result
-from hector_jax.cli.flags import BASELINES, OTHER_MASSES, Evaluate, WalkEngine, named_file
+from hector_jax.cli.flags import (
+    BASELINES,
+    NAMED_WEIGHTS,
+    OTHER_MASSES,
+    Evaluate,
+    WalkEngine,
+    named_file,
+)
 from hector_jax.cli.parse import as_command, as_table
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import Weights
@@ -25,6 +34,7 @@ from hector_jax.report.report import print_tables
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.sim.engine import Engine, choose_engine
 from hector_jax.sim.loop import Job
+from hector_jax.sim.world import Imperfections
 from hector_jax.store import tunings
 from hector_jax.store.folder import RESULT, load_run
 from hector_jax.store.setup import Setup
@@ -117,8 +127,9 @@ def plan_of(args: Evaluate) -> EvaluationPlan:
     engines, columns = _engines(args), {}
     for column in (Column(engine, model) for engine in engines for model in models):
         columns[column] = _seeds(args, args.other_seeds if columns else args.seeds)
-    cases = len(columns) * len(trajectories)
-    sets = _sets(args, robot, trajectories, paired=cases > 1 or args.out is not None)
+    first = next(iter(columns.values()))[:1]
+    _check_exact(engines, arguments.plants(args.world, first, robot.description))
+    sets = _sets(args, robot, trajectories, paired=len(columns) > 1 or args.out is not None)
     return EvaluationPlan(robot, args.world, trajectories, sets, models, columns, engines)
 
 
@@ -131,8 +142,18 @@ def _engines(args: Evaluate) -> dict[str, Engine]:
         engine = arguments.engine_of(args)
         return {engine.name: engine}
     if "all" in args.engine:
+        if len(args.engine) > 1:
+            raise InputError(f"--engine all stands alone, got {' '.join(args.engine)}")
         return _installed()
     return {name: choose_engine(name) for name in args.engine}
+
+
+def _check_exact(engines: Mapping[str, Engine], plants: Sequence[Imperfections]) -> None:
+    """Raise an InputError, before anything walks, if MJX cannot walk on the plants."""
+    if "mjx" in engines and any(np.any(x) for plant in plants for x in plant.estimator):
+        raise InputError(
+            "--engine mjx knows its state exactly: expected a --world whose estimator errs 0"
+        )
 
 
 def _seeds(args: Evaluate, count: int) -> range:
@@ -169,21 +190,23 @@ def _sets(
             pairs, there is no other set beside nominal.
     """
     given = [named_file(text) for text in args.weights]
-    short = arguments.short_names([file for _, file in given])
-    paths: dict[str, Path] = {}
+    short = arguments.short_names([file for name, file in given if not name])
+    files: dict[str, str] = {}
     for name, file in ((name or short[file], file) for name, file in given):
-        if name in paths or (name in BASELINES and file != name):
-            raise InputError(f"--weights {file}: there is a set {name!r} already; use NAME={file}")
-        paths[name] = Path(file)
-    if paired and ("nominal" not in paths or len(paths) < 2):
+        if not name or name in files or (name in BASELINES and file != name):
+            fault = f"there is a set {name!r} already" if name else "no name of a set"
+            raise InputError(f"--weights {file}: {fault}; use NAME={file}")
+        files[name] = file
+    if paired and ("nominal" not in files or len(files) < 2):
         raise InputError("--weights must be nominal, which changes are against, and other sets")
 
-    def load(path: Path, trajectory: str) -> Weights:
-        file = path / f"{trajectory}.json" if path.is_dir() else path
-        return arguments.weights_by_name(str(file), robot)
+    def load(file: str, trajectory: str) -> Weights:
+        if file not in NAMED_WEIGHTS and Path(file).is_dir():
+            file = str(Path(file, f"{trajectory}.json"))
+        return arguments.weights_by_name(file, robot)
 
     return {
-        trajectory: {name: load(path, trajectory) for name, path in paths.items()}
+        trajectory: {name: load(file, trajectory) for name, file in files.items()}
         for trajectory in trajectories
     }
 
@@ -205,6 +228,7 @@ def _walk(setup: Setup, plan: EvaluationPlan, folder: Path | None) -> Columns:
             setup,
             _jobs(plan, column),
             title=f"walking in {report.title_of(column)}",
+            where=f" in {report.title_of(column)}" * (len(plan.columns) > 1),
             folder=folder,
             engine=plan.engines[column.engine],
         ).verdict
@@ -218,8 +242,10 @@ def _jobs(plan: EvaluationPlan, column: Column) -> dict[judging.Case, Job]:
     drawn = arguments.plants(plan.world, seeds, (model.plant or plan.robot).description)
     plants = [plant._replace(mass=model.mass * plant.mass) for plant in drawn]
     return {
-        (name, of, seed): Job(w, command.command, plant, seconds, seed, plant=model.plant)
+        (name, set_name, seed): Job(
+            weights, command.command, plant, seconds, seed, plant=model.plant
+        )
         for name, (command, seconds) in plan.trajectories.items()
         for seed, plant in zip(seeds, plants, strict=True)
-        for of, w in plan.sets[name].items()
+        for set_name, weights in plan.sets[name].items()
     }

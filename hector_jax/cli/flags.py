@@ -160,7 +160,7 @@ class Train(ForRobot, Printed):
 
 
 @_command
-class Grfm(Configured, Parallel, Printed):
+class Grfm(Parallel, Printed):
     """Report how well the nets predict the ground forces of walks that they never saw.
 
     Example: hector steps grfm --seeds 0
@@ -247,7 +247,7 @@ class Evaluate(Configured, ForRobot, ByWalker, Parallel, Printed):
     runs: tuple[Run, ...] = ()  # instead: finished runs of `hector tune`, side by side
     traj: Trajectories = ("straight",)  # names (all: straight, c and s) or TOML files
     world: PlantWorld = "standin"  # world of the plants; standin-even: masses drawn evenly
-    # c: MuJoCo; mjx: it knows its state exactly; extras: drake, pinocchio; all: the installed ones
+    # c: MuJoCo; mjx: it knows its state exactly; extras: drake, pinocchio; all: all but mjx
     engine: tuple[JudgingEngine, ...] = ("c",)
     # other models of the robot: light and heavy (its masses times 0.9 and 1.1), TOML files
     plant: tuple[Annotated[str, PathKind.MODEL], ...] = ()

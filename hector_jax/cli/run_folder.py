@@ -92,12 +92,11 @@ def run_flags(args: Tune) -> Tune:
     return replace(args, out=None, resume=None)
 
 
-def begin(folder: Path, args: Tune) -> tuple[Path, Tune]:
+def begin(folder: Path, args: Tune) -> Path:
     """Create the folder of a new run with its flags in one step, so that it can be resumed.
 
     Returns:
-        The folder; if its name was not set by a flag and exists, that of the next free second. And
-        the flags.
+        The folder; if its name was not set by a flag and exists, that of the next free second.
     """
     make_folder(folder.parent)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as part:
@@ -113,7 +112,7 @@ def begin(folder: Path, args: Tune) -> tuple[Path, Tune]:
         write_json(new / CONFIG, config)
         while True:
             try:
-                return new.rename(folder), args
+                return new.rename(folder)
             except OSError as error:
                 if not folder.exists():
                     raise InputError(f"cannot write {folder}: {error.strerror}") from None
@@ -140,7 +139,8 @@ def resume(folder: Path, args: Tune) -> Tune:
     now = {"code": code_hash(*_CODE), "robot": robot_hash(load_robot(begun.robot))}
     commit = made_with.get("commit", "no commit is noted")
     check_settings(folder, {name: config[name] for name in now}, now, f"{_REMEDY} ({commit})")
-    flags = merge_flags(folder, begun, args, call_flags=_CALL_FLAGS)
+    asked = with_given(replace(args, traj=_texts(args)), args.given)
+    flags = merge_flags(folder, begun, asked, call_flags=_CALL_FLAGS)
     data = arguments.data_folder(flags.data, flags.robot, load_robot(flags.robot))
     is_made = flags.walker or flags.net or data.exists()
     if not is_made and Path(config["directory"]) != Path.cwd():
@@ -191,16 +191,21 @@ def note_settings(folder: Path, settings: dict[str, Any]) -> dict[str, Any]:
     return recorded | settings
 
 
-def of_flags(args: Tune) -> tuple[Path, Tune]:
+def _texts(args: Tune) -> tuple[str, ...]:
+    """Return the trajectories of the flags, each by itself."""
+    return tuple(arguments.trajectories_by_name(args.traj).values())
+
+
+def plan_run(args: Tune) -> tuple[Path, Tune]:
     """Return the folder of a new run and its flags, checked.
 
     Raises:
         InputError: one line with the flag that is wrong, or the folder exists.
     """
-    robot, names = load_robot(args.robot), arguments.trajectories_by_name(args.traj)
-    flags = with_given(replace(args, traj=tuple(names.values())), args.given)
-    trajectories(flags, robot)
+    robot = load_robot(args.robot)
+    flags = with_given(replace(args, traj=_texts(args)), args.given)
+    name = "-".join(trajectory.name for trajectory in trajectories(flags, robot))
     if args.out and args.out.exists():
         raise _exists_error(args.out)
     runs = arguments.robot_folder(Path("runs"), args.robot, robot)
-    return args.out or runs / "-".join(names) / f"{datetime.now():{TIME}}", flags
+    return args.out or runs / name / f"{datetime.now():{TIME}}", flags

@@ -62,7 +62,8 @@ def run_tune(args: Tune) -> None:
     if args.resume:
         folder, flags = args.resume, run_folder.resume(args.resume, args)
     else:
-        folder, flags = run_folder.begin(*run_folder.of_flags(args))
+        new, flags = run_folder.plan_run(args)
+        folder = run_folder.begin(new, flags)
     with locked(folder):
         say(f"the run folder is {folder}")
         (tune_walker if flags.walker else _tune_in)(folder, flags)
@@ -113,7 +114,7 @@ class _Tuned(NamedTuple):
     tunings: dict[str, Tuning]
     sets: dict[str, Weights]
     walks: WalkTuning | None  # whose result is `best`; None with --walks 0
-    begun: str  # name of the set that they began with
+    begun_with: str  # name of the set that these walks began with
 
 
 def _begin(pool: Executor, folder: Path, args: Tune) -> _Run:
@@ -172,7 +173,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         errors=net.errors,
         tunings=tuned.tunings,
         walks=tuned.walks,
-        begun=tuned.begun,
+        begun_with=tuned.begun_with,
         smooth=args.smooth,
         draws=best_set.DRAWS,
         **_draw(run, tuned, standin, on_hfs),
@@ -312,7 +313,7 @@ def _result(
     """Write result.json, with the verdict in each world; return its content."""
     result = metrics.verdict_result(verdicts)
     if tuned.walks:
-        result |= {"walks": tuned.walks.rows, "walks_begun_with": tuned.begun}
+        result |= {"walks": tuned.walks.rows, "walks_begun_with": tuned.begun_with}
     directions = [direction._asdict() for direction in known.directions]
     result["determined"] = {"directions": directions, "weights": known.weights}
     write_json(run.folder / RESULT, result)

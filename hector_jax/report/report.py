@@ -179,8 +179,9 @@ def print_tables(verdict: Verdict, world: str = "standin", console: Console | No
     for name, one in verdict.each.items():
         console.print(Text(f"{name}, {where}", style="bold"))
         console.print(_terminal_table(one, padding=1 if console.width >= 90 else 0))
-        for line in (ERRORS, *legend(one)):
+        for line in legend(one):
             console.print(Text(line, style="dim"))
+    console.print(Text(ERRORS, style="dim"))
 
 
 def _terminal_table(verdict: Verdict, padding: int) -> Table:

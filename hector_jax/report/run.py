@@ -27,7 +27,8 @@ def write_run_report(folder: Path, **contents: Any) -> Path:
             norms: gradient norms of the terms in log-weights at nominal, by model.
             determined: what the tuning `with` knows about its weights.
             errors: held-out errors of `raw`, `linear`, `net`, from `training.errors_by_phi`.
-            walks, begun: the `WalkTuning` that made `best`, None with --walks 0; name of its start.
+            walks: the `WalkTuning` that made `best`; None with --walks 0.
+            begun_with: name of the set that these walks began with.
             smooth: price of changes of the command between switches of stance in `best`.
             draws: variations of the model for each trajectory of `best`.
             pictures, film: list of `Picture`; `Picture` of the film, or why there is none.

@@ -10,9 +10,11 @@ from functools import partial
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from io import StringIO
+from itertools import chain, groupby
 from typing import NamedTuple
 
 import jax
+import numpy as np
 
 from hector_jax.control.controller import WalkConfig
 from hector_jax.core.identity import function_id
@@ -117,9 +119,13 @@ def _walk_mjx(
     with redirect_stdout(StringIO()):  # MJX takes a second to import and prints missing packages
         from hector_jax.sim.parallel import walk_batch
 
-    padded = [*jobs, *list(jobs[-1:]) * (batch - len(jobs))]
-    walks = walk_batch(config, robot, padded, fine=exact, single=_mjx_bits(exact) == 32)
-    return (walk for _, walk in zip(jobs, walks, strict=False))
+    def walked(alike: list[Job]) -> Iterator[Trajectory]:
+        padded = [*alike, *alike[-1:] * (batch - len(alike))]
+        walks = walk_batch(config, robot, padded, fine=exact, single=_mjx_bits(exact) == 32)
+        return (walk for _, walk in zip(alike, walks, strict=False))
+
+    shapes = groupby(jobs, lambda job: (float(job.seconds), np.shape(job.command.duration)))
+    return chain.from_iterable(walked(list(alike)) for _, alike in shapes)
 
 
 MJX = Engine("mjx", "MJX", _walk_mjx, _mjx_bits, modules=("sim.parallel",), package="mujoco-mjx")

@@ -102,9 +102,8 @@ def _file_name(setup: Setup, case: Case, job: Job, with_walk: bool, engine: Engi
     _, config, robot = setup
     parts = [engine.key, config.rollout.walk, repr(config.loss), robot, job]
     key = content_key(*parts, *([job.plant] if job.plant else []), code=(*engine.modules, *_CODE))
-    labels = (
-        re.sub(r"[^\w.-]+", "_", str(label)) for label in case
-    )  # the key tells equal ones apart
+    # labels that become equal are told apart by the key
+    labels = (re.sub(r"[^\w.-]+", "_", str(label)) for label in case)
     return "-".join(["walk" if with_walk else "score", *labels, f"{key}.npz"])
 
 
@@ -160,12 +159,15 @@ def score_jobs(
     return load_or_make(paths, make, like=like, kind="walk", robot=setup.robot)
 
 
-def judge_jobs(setup: Setup, jobs: Mapping[Case, Job], **options: Any) -> Judged:
+def judge_jobs(
+    setup: Setup, jobs: Mapping[Case, Job], *, where: str = "", **options: Any
+) -> Judged:
     """Walk every set on every trajectory and plant, score the walks and say their faults.
 
     Args:
         setup, options: see `score_jobs`.
         jobs: a job for each trajectory, set and seed.
+        where: what follows the name of a set where its faults are said.
     """
     results = score_jobs(setup, jobs, **options)
     walks = {case: walk for case, (walk, _) in results.items()}
@@ -175,8 +177,8 @@ def judge_jobs(setup: Setup, jobs: Mapping[Case, Job], **options: Any) -> Judged
         for scene in scenes
         for name in names
     }
-    several = len(scenes) > 1
-    say_faults({f"{n} on {scene}" if several else n: w for (scene, n), w in groups.items()})
+    on = {scene: f" on {scene}{where}" if len(scenes) > 1 else where for scene in scenes}
+    say_faults({f"{name}{on[scene]}": walks for (scene, name), walks in groups.items()})
     scores = {
         scene: {name: [walk.score for walk in groups[scene, name]] for name in names}
         for scene in scenes
@@ -196,7 +198,6 @@ def judge(
     title: str,
     seconds: float = 4.0,
     folder: Path | None = None,
-    plant: Robot | None = None,
     engine: Engine = MUJOCO_C,
 ) -> Judged:
     """Walk every weight set on every trajectory and plant, and score the walks.
@@ -209,16 +210,15 @@ def judge(
         title: title of the progress bar.
         folder: folder of the scores, and of the walks on the first plant; walks whose scores are
             in it are not repeated; None: nothing is saved.
-        plant: another model of the robot, to which the plants belong.
         engine: engine of the walks.
 
     Raises:
         InputError: the folder cannot be written, or the engine cannot walk a plant.
     """
     jobs = {
-        (scene, name, seed): Job(weights, command, imperfections, seconds, seed, plant=plant)
+        (scene, name, seed): Job(weights, command, plant, seconds, seed)
         for scene, command in commands.items()
-        for imperfections, seed in zip(plants, seeds, strict=True)
+        for plant, seed in zip(plants, seeds, strict=True)
         for name, weights in sets.items()
     }
     first = [case for case in jobs if case[2] == seeds[0]] if folder else []

@@ -201,7 +201,7 @@ def _losses_on_shared_seeds(verdicts: Sequence[Verdict]) -> list[dict[str, np.nd
 
 
 def matrix_result(cells: Cells, world: str) -> dict[str, Any]:
-    """Return all columns as JSON values: the content of verdict.json.
+    """Return all columns as JSON values: `world` and what follows, of verdict.json.
 
     `columns` is a list of `engine`, `model`, `seeds` and `trajectories.<name>`, each as the `sets`
     of result.json, with `falls_share` and `fallen_by_seed` beside `falls`; `sets.<name>` has the
@@ -229,7 +229,7 @@ def matrix_result(cells: Cells, world: str) -> dict[str, Any]:
         sets[name] = {**_plain(falls(cells, name)), "against": against}
     kendall = [_plain(agreement) for agreement in agreements(cells)]
     return {
-        "family": metrics.family_of(world),
+        "world": world,
         "columns": columns,
         "sets": sets,
         "kendall": kendall,
