@@ -1,5 +1,9 @@
 """The closed loop in MuJoCo C."""
 
+import json
+import os
+import subprocess
+import sys
 from functools import partial
 from itertools import product
 
@@ -78,6 +82,17 @@ def test_stance_follows_the_gait_and_a_foot_in_the_air_is_told_nothing(short):
     np.testing.assert_array_equal(right, ~left)
     assert not np.any(short.command.force[~short.contact])
     assert not np.any(short.command.moment[~short.contact])
+
+
+def test_a_walk_as_the_user_has_it_has_the_losses_that_are_noted():
+    """From the command line, with the optimisations that the tests leave out."""
+    words = "walk --traj s --seconds 0.5 --world hfs --weights expert --json".split()
+    usual = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    line = [sys.executable, "-m", "hector_jax", *words]
+    told = json.loads(subprocess.run(line, env=usual, capture_output=True, check=True).stdout)
+    noted = {"L_Eul": 1.2055268, "L_pos": 2.4811933, "L_ctrl": 61943.913}
+    assert {name: told[name] for name in noted} == pytest.approx(noted, rel=1e-3)
+    assert (told["fell"], told["plans"], told["unsolved"]) == (False, 50, 0)
 
 
 def test_a_seed_gives_the_same_bytes():
