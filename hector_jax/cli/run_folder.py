@@ -135,10 +135,12 @@ def resume(folder: Path, args: Tune) -> Tune:
     config, made_with = read_object(path), read_object(folder / VERSIONS)
     for name in ("robot", "code", "directory"):
         convert(config.get(name), str, name=f"{path}: {name}")
+    remedy = f"{_REMEDY} ({made_with.get('commit', 'no commit is noted')})"
+    # the flags of other code may be others
+    check_settings(folder, {"code": config["code"]}, {"code": code_hash(*_CODE)}, remedy)
     begun = from_file(Tune, path)
-    now = {"code": code_hash(*_CODE), "robot": robot_hash(load_robot(begun.robot))}
-    commit = made_with.get("commit", "no commit is noted")
-    check_settings(folder, {name: config[name] for name in now}, now, f"{_REMEDY} ({commit})")
+    robot = robot_hash(load_robot(begun.robot))
+    check_settings(folder, {"robot": config["robot"]}, {"robot": robot}, remedy)
     asked = with_given(replace(args, traj=_texts(args)), args.given)
     flags = merge_flags(folder, begun, asked, call_flags=_CALL_FLAGS)
     data = arguments.data_folder(flags.data, flags.robot, load_robot(flags.robot))
