@@ -149,14 +149,12 @@ def plants(world: str, seeds: range, description: Description) -> list[Imperfect
     return [draw(seed, description) for seed in seeds]
 
 
-def plant_of(path: Path | None, robot: Robot) -> Robot | None:
-    """Load the plant's model of the robot; None without a file.
+def load_plant(path: Path, robot: Robot) -> Robot:
+    """Load another model of the robot.
 
     Raises:
         InputError: its file is wrong, or its joints are not the robot's.
     """
-    if path is None:
-        return None
     plant = load_robot(path)
     check_plant(robot.description, plant.description)
     return plant

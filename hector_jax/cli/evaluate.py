@@ -119,8 +119,11 @@ def plan_of(args: Evaluate) -> EvaluationPlan:
         trajectories[name] = trajectory, arguments.walk_seconds(args, trajectory)
     models = {OWN: PlantModel()}
     for text in args.plant:
-        model = PlantModel(OTHER_MASSES[text]) if text in OTHER_MASSES else _model_of(text, robot)
-        name = text if model.plant is None else model.plant.description.name
+        if text in OTHER_MASSES:
+            name, model = text, PlantModel(mass=OTHER_MASSES[text])
+        else:
+            plant = arguments.load_plant(Path(text), robot)
+            name, model = plant.description.name, PlantModel(plant=plant)
         if name in models:
             raise InputError(f"--plant {text}: there is a model {name!r} already")
         models[name] = model
@@ -131,10 +134,6 @@ def plan_of(args: Evaluate) -> EvaluationPlan:
     _check_exact(engines, arguments.plants(args.world, first, robot.description))
     sets = _sets(args, robot, trajectories, paired=len(columns) > 1 or args.out is not None)
     return EvaluationPlan(robot, args.world, trajectories, sets, models, columns, engines)
-
-
-def _model_of(text: str, robot: Robot) -> PlantModel:
-    return PlantModel(plant=arguments.plant_of(Path(text), robot))
 
 
 def _engines(args: Evaluate) -> dict[str, Engine]:
@@ -193,9 +192,8 @@ def _sets(
     short = arguments.short_names([file for name, file in given if not name])
     files: dict[str, str] = {}
     for name, file in ((name or short[file], file) for name, file in given):
-        if not name or name in files or (name in BASELINES and file != name):
-            fault = f"there is a set {name!r} already" if name else "no name of a set"
-            raise InputError(f"--weights {file}: {fault}; use NAME={file}")
+        if name in files or (name in BASELINES and file != name):
+            raise InputError(f"--weights {file}: there is a set {name!r} already; use NAME={file}")
         files[name] = file
     if paired and ("nominal" not in files or len(files) < 2):
         raise InputError("--weights must be nominal, which changes are against, and other sets")

@@ -61,7 +61,7 @@ def run_walk(args: Walk) -> None:
     if args.video is not None:
         check_film(args.video)
     robot = arguments.with_gait(load_robot(args.robot), args.gait)
-    plant = arguments.plant_of(args.plant, robot)
+    plant = arguments.load_plant(args.plant, robot) if args.plant else None
     _check_world(args)
     engine, weights = arguments.engine_of(args), arguments.weights_by_name(args.weights, robot)
     command = arguments.load_trajectory(args.traj, robot)
