@@ -38,8 +38,8 @@ from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import loss_of
+from hector_jax.walk_tuning import added_logs, walk_log, walks
 from hector_jax.walk_tuning import campaign as campaigns
-from hector_jax.walk_tuning import reported_walks, walk_log, walks
 from hector_jax.walk_tuning.best_set import drawn_plants
 
 # all walks of this file are of these ticks and this command: one set of programs for all tests
@@ -105,13 +105,13 @@ def test_walks_through_files_equal_those_in_process_to_the_last_bit(
 ):
     one, (_, theirs) = campaign(tmp_path, robot), in_process
     for number in range(SETS):
-        found = reported_walks.read_reports(pool, one)  # as a new process would
+        found = added_logs.read_campaign(pool, one)  # as a new process would
         assert (found.number, found.again, found.tuning.reason) == (number, None, "")
         waiting = load_weights(walks.weights_path(tmp_path, number), robot)
         assert same(waiting, found.waiting)
         log = walked(robot, waiting, tmp_path / f"{number}.npz")
-        reported_walks.add_report(one, number, [log])
-    mine = reported_walks.read_reports(pool, one).tuning
+        added_logs.add_logs(one, number, [log])
+    mine = added_logs.read_campaign(pool, one).tuning
     assert same_sets(mine.sets, theirs.sets)
     assert [x.accepted for x in mine.sets].count(True) > 1
     assert mine.best == theirs.best > 0

@@ -231,7 +231,7 @@ class Add(Printed):
     folder: Folder  # of `hector propose`
     # one of each trajectory, in their order or as NAME=FILE (docs/howto/walks.md)
     logs: tuple[Annotated[str, PathKind.LOG], ...] = field(metadata={"or": "undo"})
-    undo: bool = False  # take no logs, but take back the last report: its walk is waited for again
+    undo: bool = False  # take no logs, but take back the last ones: their walk is waited for again
 
 
 @_command

@@ -21,12 +21,12 @@ from hector_jax.core.runtime import workers
 from hector_jax.robot.model import load_robot
 from hector_jax.store import tunings
 from hector_jax.store.folder import CONFIG
-from hector_jax.walk_tuning import best_set, reported_walks, walk_log, walks
+from hector_jax.walk_tuning import added_logs, best_set, walk_log, walks
 from hector_jax.walk_tuning.campaign import Campaign
 
 
 def run_propose(args: Propose) -> None:
-    """Propose the next weights to walk with, the same ones until their walk is reported."""
+    """Propose the next weights to walk with, the same ones until their logs are added."""
     path = args.folder / CONFIG
     if path.exists():
         call_flags = ("folder", "json")
@@ -34,7 +34,7 @@ def run_propose(args: Propose) -> None:
     campaign = _campaign(args)
     make_folder(args.folder)
     with locked(args.folder), workers(PROCESSES) as pool:
-        found = reported_walks.read_reports(pool, campaign)
+        found = added_logs.read_campaign(pool, campaign)
         if not path.exists():  # last, so that rejected flags can be corrected
             write_json(path, {"flags": as_table(args)})
     number, ended = found.number, found.tuning.reason
@@ -64,11 +64,11 @@ def run_add(args: Add) -> None:
     texts = list(map(str, args.logs))
     files = _files(texts, list(campaign.commands))
     with locked(args.folder), workers(PROCESSES) as pool:
-        number = reported_walks.read_reports(pool, campaign).number
+        number = added_logs.read_campaign(pool, campaign).number
         named = [name for name, _ in map(named_file, texts)]
         tracked = _check_logs(campaign, number, files, named)
-        reported_walks.add_report(campaign, number, list(files.values()))
-        found = reported_walks.read_reports(pool, campaign)
+        added_logs.add_logs(campaign, number, list(files.values()))
+        found = added_logs.read_campaign(pool, campaign)
     sets, best, again = found.tuning.sets, found.tuning.best, found.again
     changes = walks.changes(sets)
     change = changes[number] if number < len(sets) else again and again.change
@@ -90,7 +90,7 @@ def run_add(args: Add) -> None:
 
 def _undo(args: Add, campaign: Campaign) -> None:
     with locked(args.folder):
-        number, paths = reported_walks.undo_report(campaign)
+        number, paths = added_logs.undo_logs(campaign)
     weights, logs = str(walks.weights_path(args.folder, number)), [str(path) for path in paths]
     text = f"walk {number} is to be walked again, with {weights}; its logs: {' '.join(logs)}"
     result = {"walk": number, "weights": weights, "logs": logs}
@@ -141,7 +141,7 @@ def _check_logs(
         if not walk_log.check_card(file, name, proposed, path) and name not in named:
             walk_log.check_fit(file, name, tracked)
         if again := [p for p in before if p.read_bytes() == file.read_bytes()]:
-            raise InputError(f"{file}: was reported before, it is {again[0]}")
+            raise InputError(f"{file}: was added before, it is {again[0]}")
     return result
 
 

@@ -39,8 +39,8 @@ class Campaign:
         return list(product(self.plants, self.commands.values()))
 
     @property
-    def reported(self) -> bool:
-        """True if the walks are made elsewhere and their logs reported."""
+    def by_logs(self) -> bool:
+        """True if the walks are made elsewhere and their logs added."""
         return all(plant is None for plant in self.plants)
 
     @property

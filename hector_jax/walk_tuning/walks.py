@@ -5,12 +5,12 @@ cases. Gradient and Gauss-Newton matrix are those of the rigid body grounded on 
 (tuning/grounded.py), each divided by its loss. Steps, acceptance and stop are those of
 `difftune.descend`. A fall counts as a bounded loss of its case and has no slope; the rest still
 steers. A set that falls in more cases than the start is refused. Whether a simulator (`walk_all`)
-or a real robot (`reported_walks`) walks, all that the loop uses is in a folder, so that it begins
+or a real robot (`added_logs`) walks, all that the loop uses is in a folder, so that it begins
 anew in each call and no walk is made twice:
 
 - `walks.jsonl`: the settings, then a line for each weight set that has walked.
 - `weights/3.json`: the weights of set 3.
-- `logs/3-0.npz`: its log in case 0, at the plan interval, or the file that was reported.
+- `logs/3-0.npz`: its log in case 0, at the plan interval, or the file that was added.
 - `starts/with`: the same of a set that was tried as the start.
 """
 
@@ -278,7 +278,7 @@ def tune_on_walks(
             loss = Objective(objective.slope, objective.place)
             tuning = difftune.descend(config, campaign.start, loss, on_iteration)
         except Waiting:
-            write_record()  # without sets whose report was undone
+            write_record()  # without sets whose logs were taken back
             waiting = load_weights(weights_path(campaign.folder, len(sets)), campaign.robot)
             return WalkTuning(sets, waiting, "")
         except InputError:
@@ -291,7 +291,7 @@ def tune_on_walks(
 def _remedy(campaign: Campaign) -> str:
     """Return what to do with a folder of another campaign."""
     anew = f" and begin anew with hector propose --start {campaign.folder}/weights/N.json"
-    return f"choose another folder{anew * campaign.reported}"
+    return f"choose another folder{anew * campaign.by_logs}"
 
 
 def _head(campaign: Campaign) -> dict[str, Any]:
@@ -304,7 +304,7 @@ def _head(campaign: Campaign) -> dict[str, Any]:
         "numbers": list(campaign.config.others),
         "seconds": campaign.seconds,
     }
-    if campaign.reported:  # data: neither code nor loss can make them those of another campaign
+    if campaign.by_logs:  # data: neither code nor loss can make them those of another campaign
         return head | {"robot": walker_hash(campaign.robot)}
     settings = replace(campaign.config, iterations=1)  # with a larger budget it goes on
     return head | {

@@ -1,6 +1,6 @@
-"""Walks that were made elsewhere, on a robot or in another simulator, and whose logs are reported.
+"""Walks that were made elsewhere, on a robot or in another simulator, and whose logs are added.
 
-They are data: the files that were reported are kept as they came, and each call scores them anew,
+They are data: the files that were added are kept as they came, and each call scores them anew,
 so that all are of one code and one loss. When the tuning has ended the best set is walked again:
 what is said of it then does not rest on the walk that chose it.
 """
@@ -37,7 +37,7 @@ class Again(NamedTuple):
     clear: bool  # against the spread of its walks
 
 
-class Reports(NamedTuple):
+class AddedLogs(NamedTuple):
     """The walks of a folder."""
 
     tuning: WalkTuning
@@ -46,7 +46,7 @@ class Reports(NamedTuple):
     again: Again | None  # None: the best set has not walked again
 
 
-def read_reports(pool: Executor, campaign: Campaign) -> Reports:
+def read_campaign(pool: Executor, campaign: Campaign) -> AddedLogs:
     """Return the walks so far, scored by the present code; begin the record if it is new.
 
     Raises:
@@ -60,7 +60,7 @@ def read_reports(pool: Executor, campaign: Campaign) -> Reports:
     if number and not tuning.sets[0].accepted:
         raise InputError(f"{campaign.folder}: {tuning.reason}; tune from another")
     if tuning.waiting is not None:
-        return Reports(tuning, tuning.waiting, number, None)
+        return AddedLogs(tuning, tuning.waiting, number, None)
     best, again = tuning.sets[tuning.best].weights, []
     while all(path.exists() for path in walks.log_paths(campaign, number)):
         walked = load_weights(walks.weights_path(campaign.folder, number), campaign.robot)
@@ -68,7 +68,7 @@ def read_reports(pool: Executor, campaign: Campaign) -> Reports:
             again.append(np.array([log.loss for log in ask(number, best)]))
         number += 1
     save_weights(walks.weights_path(campaign.folder, number), best)
-    return Reports(tuning, best, number, _again(tuning, again) if again else None)
+    return AddedLogs(tuning, best, number, _again(tuning, again) if again else None)
 
 
 def _again(tuning: WalkTuning, again: Sequence[np.ndarray]) -> Again:
@@ -85,7 +85,7 @@ def _again(tuning: WalkTuning, again: Sequence[np.ndarray]) -> Again:
 def _scored(
     pool: Executor, campaign: Campaign, number: int, weights: Weights
 ) -> Sequence[ScoredLog]:
-    """Return the scored logs of a set that was reported; `Waiting` if it was not."""
+    """Return the scored logs of a set that has them; `Waiting` if it has none."""
     paths = walks.log_paths(campaign, number)
     if not all(path.exists() for path in paths):
         raise walks.Waiting
@@ -96,17 +96,17 @@ def _scored(
     return [job.result() for job in running]
 
 
-def add_report(campaign: Campaign, number: int, files: Sequence[Path]) -> None:
+def add_logs(campaign: Campaign, number: int, files: Sequence[Path]) -> None:
     """Save the logs of a set in the folder, the last one last: with it the set has walked."""
     logs = [file.read_bytes() for file in files]
     paths = walks.log_paths(campaign, number)
-    _set_aside(paths)  # logs of a report that was interrupted
+    _set_aside(paths)  # logs of a call that was interrupted
     for path, log in zip(paths, logs, strict=True):
         write_file(path, log)
 
 
-def undo_report(campaign: Campaign) -> tuple[int, list[Path]]:
-    """Take back the last report; its set waits for its walk again.
+def undo_logs(campaign: Campaign) -> tuple[int, list[Path]]:
+    """Take back the last logs; their set waits for its walk again.
 
     Returns:
         Number of the set, and its logs under the names that they have from now on.
@@ -118,7 +118,7 @@ def undo_report(campaign: Campaign) -> tuple[int, list[Path]]:
     while all(path.exists() for path in walks.log_paths(campaign, number)):
         number += 1
     if not number:
-        raise InputError(f"{campaign.folder}: no report to undo")
+        raise InputError(f"{campaign.folder}: no logs to take back")
     for path in walks.weights_path(campaign.folder, number).parent.glob("*.json"):
         if path.stem.isdigit() and int(path.stem) >= number:
             path.unlink()  # of the set that this walk has led to

@@ -1,4 +1,4 @@
-"""Reports of walks: whose log is refused, what is shown, undone and kept, and how it ends.
+"""Logs that are added: whose log is refused, what is shown, undone and kept, and how it ends.
 
 The logs are drawn, not walked, and so is the slope: what is tried here is what the folder makes of
 them.
@@ -28,7 +28,7 @@ from hector_jax.core.tree_file import named_leaves, save_tree
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import loss_of_robot
-from hector_jax.walk_tuning import reported_walks, walk_log, walks
+from hector_jax.walk_tuning import added_logs, walk_log, walks
 
 SECONDS = 0.1
 SPEEDS = {"ahead": (0.5, 0.0), "aside": (0.0, 0.5), "back": (-0.5, 0.0)}
@@ -51,7 +51,7 @@ def slope_of(campaign, weights, case, log):
 
 @pytest.fixture
 def folder(monkeypatch, tmp_path):
-    """A folder for reports of three trajectories, in which nothing is computed for a proposal."""
+    """A folder for logs of three trajectories, in which nothing is computed for a proposal."""
     pool = HandsOver()
     monkeypatch.setattr(propose, "workers", lambda *_: nullcontext(pool))
     monkeypatch.setattr(walks, "_slope", slope_of)
@@ -110,7 +110,7 @@ def carded(folder, name, path=None, *, weights=None, number=0, card=None, **opti
     return path
 
 
-def report(folder, *logs, **flags):
+def add(folder, *logs, **flags):
     propose.run_add(Add(folder, logs, json=True, **flags))
 
 
@@ -125,10 +125,10 @@ def result(capsys):
 
 
 def refused(folder, words, *logs, **flags):
-    """A report is refused in one line, and the folder is as it was."""
+    """Logs are refused in one line, and the folder is as it was."""
     before = content(folder)
     with pytest.raises(InputError, match=words) as error:
-        report(folder, *logs, **flags)
+        add(folder, *logs, **flags)
     assert "\n" not in str(error.value)
     assert content(folder) == before
 
@@ -181,23 +181,23 @@ def test_what_a_campaign_cannot_do_now_is_one_line(folder):
     with pytest.raises(InputError, match="begun with --traj ahead.toml, got s"):
         propose.run_propose(Propose(folder, ("s",)))
     log = carded(folder, "ahead")
-    report(folder, log)
+    add(folder, log)
     refused(folder, "other weights than the proposed ones, robot/weights/1.json", log)
     with np.load(log) as archive:
         np.savez("bare.npz", **{n: x for n, x in archive.items() if n != "card"})
-    report(folder, "bare.npz")
-    refused(folder, "^bare.npz: was reported before, it is robot/logs/1-0.npz$", "bare.npz")
+    add(folder, "bare.npz")
+    refused(folder, "^bare.npz: was added before, it is robot/logs/1-0.npz$", "bare.npz")
     with pytest.raises(InputError, match="nothing was proposed here"):
-        report(Path("other"), log)
+        add(Path("other"), log)
 
 
-def test_a_fallen_walk_is_reported_as_one(folder, capsys):
+def test_a_fallen_walk_is_added_as_one(folder, capsys):
     next_walk(folder, ("ahead",))
-    report(folder, plain("ahead"))
+    add(folder, plain("ahead"))
     next_walk(folder, ("ahead",))
     capsys.readouterr()
     # it fits another trajectory better, as a walk that fell may
-    report(folder, plain("back", "ahead.npz", fall_at=0.04))
+    add(folder, plain("back", "ahead.npz", fall_at=0.04))
     seen = json.loads((captured := capsys.readouterr()).out)
     assert "fell after 0.04 s" in " ".join(captured.err.split())
     assert (seen["walk"], seen["best"], seen["change"]) == (1, 0, None)
@@ -205,16 +205,16 @@ def test_a_fallen_walk_is_reported_as_one(folder, capsys):
     assert seen["logs"]["ahead"]["seconds"] == pytest.approx(0.04)
 
 
-def test_a_report_that_is_undone_and_made_again_leaves_the_same_bytes(folder, capsys):
+def test_logs_that_are_undone_and_added_again_leave_the_same_bytes(folder, capsys):
     next_walk(folder, ("ahead",))
-    report(folder, plain("ahead", "0.npz"))
+    add(folder, plain("ahead", "0.npz"))
     next_walk(folder)
     before = content(folder)
-    report(folder, carded(folder, "ahead", "1.npz", number=1))
+    add(folder, carded(folder, "ahead", "1.npz", number=1))
     after = content(folder)
     next_walk(folder)  # which the undo makes void
     capsys.readouterr()
-    report(folder, undo=True)
+    add(folder, undo=True)
     undone = result(capsys)
     assert (undone["walk"], undone["weights"]) == (1, "robot/weights/1.json")
     log = Path(*undone["logs"])
@@ -224,21 +224,21 @@ def test_a_report_that_is_undone_and_made_again_leaves_the_same_bytes(folder, ca
     now = content(folder)
     assert now.pop(str(log.relative_to(folder)))
     assert now == before
-    report(folder, "1.npz")
+    add(folder, "1.npz")
     again = content(folder)
     assert again.items() >= after.items()
     assert again.keys() - after.keys() == {str(log.relative_to(folder))}
 
 
-def test_the_first_report_can_be_undone_and_another_one_cannot(folder, capsys):
+def test_the_first_logs_can_be_undone_and_others_cannot(folder, capsys):
     """The start fell in all: a tuning has nowhere to begin, and another log may."""
     next_walk(folder, ("ahead",))
     before = content(folder)
     with pytest.raises(
         InputError, match="robot: the start fell or was not solved in all walks; tune from another"
     ):
-        report(folder, plain("ahead", fall_at=0.04))
-    report(folder, undo=True)
+        add(folder, plain("ahead", fall_at=0.04))
+    add(folder, undo=True)
     undone = result(capsys)
     assert undone["walk"] == 0
     next_walk(folder)
@@ -246,8 +246,8 @@ def test_the_first_report_can_be_undone_and_another_one_cannot(folder, capsys):
     now = content(folder)
     assert now.pop(str(Path(*undone["logs"]).relative_to(folder)))
     assert now == before
-    refused(folder, "^robot: no report to undo$", undo=True)
-    report(folder, plain("ahead"))
+    refused(folder, "^robot: no logs to take back$", undo=True)
+    add(folder, plain("ahead"))
     assert result(capsys)["walk"] == 0
 
 
@@ -256,21 +256,21 @@ def campaign(folder):
 
 
 def read(folder):
-    return reported_walks.read_reports(HandsOver(), campaign(folder))
+    return added_logs.read_campaign(HandsOver(), campaign(folder))
 
 
 @pytest.mark.parametrize("undo", [True, False])
-def test_a_report_or_undo_that_is_killed_leaves_the_old_or_the_new_state(folder, undo):
+def test_adding_or_undoing_that_is_killed_leaves_the_old_or_the_new_state(folder, undo):
     """Killed before and after each of its writes; then the same once more."""
     next_walk(folder, ("ahead",))
-    report(folder, carded(folder, "ahead", "0.npz"))
+    add(folder, carded(folder, "ahead", "0.npz"))
     next_walk(folder)
     log = carded(folder, "ahead", "1.npz", number=1)
     if undo:
-        report(folder, log)
+        add(folder, log)
         next_walk(folder)
-    reported, undone = ((log,), {}), ((), {"undo": True})
-    (logs, flags), (logs_back, flags_back) = (undone, reported) if undo else (reported, undone)
+    added, undone = ((log,), {}), ((), {"undo": True})
+    (logs, flags), (logs_back, flags_back) = (undone, added) if undo else (added, undone)
     log_kept, kills, calls = folder / "logs" / "1-0.npz", 0, []
     old = content(folder)
 
@@ -294,7 +294,7 @@ def test_a_report_or_undo_that_is_killed_leaves_the_old_or_the_new_state(folder,
             for module, name in writes:
                 patch.setattr(module, name, killed(getattr(module, name), at, after))
             with suppress(KeyboardInterrupt):
-                report(folder, *logs, **flags)
+                add(folder, *logs, **flags)
         if len(calls) < at and not after:
             break
         kills += len(calls) >= at
@@ -302,18 +302,18 @@ def test_a_report_or_undo_that_is_killed_leaves_the_old_or_the_new_state(folder,
         walked = log_kept.exists()
         assert read(folder).number == (2 if walked else 1)
         if walked != undo:
-            report(folder, *logs_back, **flags_back)
+            add(folder, *logs_back, **flags_back)
         next_walk(folder)
         assert {n: x for n, x in content(folder).items() if "undone" not in n} == old
     assert kills == 2 * len(calls) >= 4
 
 
-def test_reports_outlive_the_code_that_took_them_and_are_scored_by_the_present_loss(
+def test_logs_outlive_the_code_that_took_them_and_are_scored_by_the_present_loss(
     folder, monkeypatch
 ):
     for number in (1, 2):
         next_walk(folder, ("ahead", "aside"))
-        report(folder, *(plain(name, error=0.003 * number) for name in ("ahead", "aside")))
+        add(folder, *(plain(name, error=0.003 * number) for name in ("ahead", "aside")))
     before, files = read(folder), content(folder)
     for module in ("store.cache", "walk_tuning.walks"):
         monkeypatch.setattr(f"hector_jax.{module}.code_hash", lambda *_: "of other code")
@@ -349,7 +349,7 @@ def loss_of_ahead(folder, error):
 
 @pytest.fixture
 def ended(folder, monkeypatch, capsys):
-    """A function that reports walks with these errors [m] until, after two steps, a tuning ends."""
+    """A function that adds walks with these errors [m] until, after two steps, a tuning ends."""
     monkeypatch.setitem(LENGTH, "slope", 0.9)
 
     def walked(*errors, names=("ahead",), **options):
@@ -357,7 +357,7 @@ def ended(folder, monkeypatch, capsys):
         for number, error in enumerate(errors):
             logs = [plain(name, f"{name}-{number}.npz", error=error) for name in names]
             capsys.readouterr()
-            report(folder, *logs, **options)
+            add(folder, *logs, **options)
         return result(capsys)
 
     return walked
@@ -375,14 +375,14 @@ def test_the_best_set_of_a_tuning_that_has_ended_is_asked_for_again(folder, ende
     best = Path(found["weights"])
     assert best == folder / "weights" / "2.json"
     assert Path(asked["weights"]).read_bytes() == best.read_bytes()
-    refused(folder, "was reported before, it is robot/logs/2-0.npz", "ahead-2.npz")
+    refused(folder, "was added before, it is robot/logs/2-0.npz", "ahead-2.npz")
 
 
 def test_the_best_set_is_called_clear_by_walks_that_did_not_choose_it(folder, ended, capsys):
     ended(0.02, 0.015, 0.01)
     start, *again = (np.log(loss_of_ahead(folder, error)) for error in (0.02, 0.0105, 0.011))
     for number, (error, logs) in enumerate(((0.0105, 1), (0.011, 2)), 3):
-        report(folder, plain("ahead", f"again-{number}.npz", error=error))
+        add(folder, plain("ahead", f"again-{number}.npz", error=error))
         found = result(capsys)
         mean = np.mean(again[:logs]) - start
         assert (found["walk"], found["best"]) == (number, 2)
@@ -409,9 +409,9 @@ def test_a_gain_that_only_the_walk_that_chose_the_set_shows_is_not_called_clear(
 def test_a_walk_of_the_best_set_is_undone_and_the_same_set_waits(folder, ended, capsys):
     ended(0.02, 0.015, 0.01)
     before = content(folder)
-    report(folder, plain("ahead", "last.npz", error=0.0105))
+    add(folder, plain("ahead", "last.npz", error=0.0105))
     capsys.readouterr()
-    report(folder, undo=True)
+    add(folder, undo=True)
     undone = result(capsys)
     assert (undone["walk"], undone["weights"]) == (3, "robot/weights/3.json")
     next_walk(folder)
@@ -435,7 +435,7 @@ def test_again_compares_the_cases_in_which_all_stood(folder, ended, capsys):
     for number, error in enumerate((0.02, 0.015, 0.01, 0.0105)):
         aside = {"fall_at": 0.04} if number == 0 else {"error": error}
         capsys.readouterr()
-        report(
+        add(
             folder,
             plain("ahead", f"ahead-{number}.npz", error=error),
             plain("aside", f"aside-{number}.npz", **aside),
@@ -469,9 +469,9 @@ def test_the_log_of_a_walk_with_the_proposed_file_is_taken(folder, capsys):
     next_walk(folder, ("ahead",), start="uneven.json")
     first = result(capsys)["weights"]
     refused(folder, f"other weights than the proposed ones, {first}", walked("uneven.json"))
-    report(folder, walked(first))
+    add(folder, walked(first))
     next_walk(folder)  # the other flags are those of the folder
     second = result(capsys)["weights"]
     refused(folder, f"other weights than the proposed ones, {second}", walked(first))
-    report(folder, f"ahead={walked(second, world='standin', seed=3)}")
+    add(folder, f"ahead={walked(second, world='standin', seed=3)}")
     assert result(capsys)["walk"] == 1
