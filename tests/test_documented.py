@@ -54,7 +54,7 @@ def words_of(line):
         small = small[: small.index("--walk-plants")]
     if command == "tune" and "--walker" in words:  # or as the run that is resumed
         small = ["--seeds", "1"]
-    if "--resume" in words:
+    if {"--resume", "--runs"} & {*words}:
         small = []
     if command == "tune" and "--walks" in words and "0" not in words:
         words[words.index("--walks") + 1] = "6" if "c" in words else "4"
@@ -63,7 +63,9 @@ def words_of(line):
     files = command not in SECONDS or "runs/robot" in line  # that `hector propose` was given
     long = "--walker" in words
     words = [one for word in words for one in found(word, files, "long" if long else "short")]
-    if command in SECONDS and "--seconds" not in words and "short/" not in " ".join(words):
+    if {"--seconds", "--runs"} & {*words}:
+        return [*top, command, *words, *small]
+    if command in SECONDS and "short/" not in " ".join(words):
         small += ["--seconds", str(LENGTHS["long"] if long else SECONDS[command])]
     return [*top, command, *words, *small]
 
