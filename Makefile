@@ -49,8 +49,10 @@ test: $(STAMP) ## the fast tests
 quick: $(STAMP) ## the fast tests of controller, QP and tuner
 	@$(BIN)/pytest -q -n 2 --dist loadfile $(QUICK_TESTS)
 
+# CI leaves out the longest tests by MARKS="not long"
+MARKS ?= slow or not slow
 test-all: $(STAMP) ## the fast and the slow tests; then those of quick, each call's shapes checked
-	@$(BIN)/pytest -q -n 2 --dist loadfile -m "slow or not slow"
+	@$(BIN)/pytest -q -n 2 --dist loadfile -m "$(MARKS)"
 	@$(BIN)/pytest -q -n 2 --dist loadfile --jaxtyping-packages=hector_jax,beartype.beartype $(QUICK_TESTS)
 
 bench: $(STAMP) ## benchmarks on this machine, as JSON; peers come with pip install -e ".[bench]"

@@ -216,6 +216,7 @@ def test_two_hosts_give_the_numbers_of_one():
         check_end(process)
 
 
+@pytest.mark.long
 @pytest.mark.slow  # minutes of compilation
 def test_on_the_rigid_body_a_batch_is_its_single_tunings():
     """With the ticks of a walk in turn, and with all of them at once."""

@@ -78,6 +78,7 @@ def test_strider_walks_five_metres_untuned(strider):
         assert max(abs(aside) / 5, abs(up)) < 0.1, world
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_strider_is_tuned_by_the_same_command_and_a_run_knows_its_robot(
     monkeypatch, strider, tmp_path

@@ -202,6 +202,7 @@ def test_walks_are_collected_on_either_engine_and_a_net_is_trained_on_them(
     assert {"raw", "net"} <= told["errors"].keys()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     """From nothing to a verdict, small: data, net, two tunings, judges, report."""

@@ -233,6 +233,7 @@ def test_aligned_loss_weights_are_powers_of_ten_that_level_the_gradients():
     assert loss == with_alphas({"L_Eul": 1e5, "L_pos": 1e7})
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_ten_iterations_go_below_a_hundred_of_the_papers():
     papers = TuneConfig(rule="relative", iterations=100)

@@ -177,7 +177,9 @@ def cases():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("config", "bar"), [(SHORT, 1e-6), (LONG, 1e-4)])
+@pytest.mark.parametrize(
+    ("config", "bar"), [(SHORT, 1e-6), pytest.param(LONG, 1e-4, marks=pytest.mark.long)]
+)
 def test_the_gradient_is_that_of_differences_from_anywhere(cases, config, bar):
     for case, weights, scenario in cases:
         assert not walk(config, scenario, weights).fallen.any(), case

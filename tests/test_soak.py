@@ -80,6 +80,7 @@ def test_memory_arrays_and_open_files_stay_flat_over_500_iterations():
     assert counts[1] == counts[0]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_256_closed_loops_at_once_stay_under_6_gib():
     """With their gradients, in a process of its own."""
