@@ -73,7 +73,7 @@ def test_the_table_has_a_row_for_each_set_and_marks_a_comparison_that_falls_make
     text = printed(pretend_verdict())  # plain and uncut, as there is no terminal
     head, *rows = [line for line in text.splitlines() if line.strip()][1:]
     assert head.split()[:6] == ["set", "plane", "height", "pitch", "L", "falls"]
-    assert "x1e6" in rows[0]
+    assert rows[0].split()[:4] == ["[cm]", "[cm]", "[deg]", "x1e6"]
     assert [row.split()[0] for row in rows[2:6]] == list(SETS)
     assert "hardware stand-in" in text
     for words in ("does not count", "touched", "\x1b", "…"):

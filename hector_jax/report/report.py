@@ -191,7 +191,7 @@ def _terminal_table(verdict: Verdict, padding: int) -> Table:
     errors = ("plane\n[cm]", "height\n[cm]", "pitch\n[deg]")
     changes = (f"against {baseline}\n[%]" for baseline in others)
     for head in (*errors, f"L\n{loss.unit}", "falls\n", *changes):
-        table.add_column(head, justify="right", no_wrap=True)
+        table.add_column(Text(head), justify="right", no_wrap=True)  # [cm] is no markup
     for name, summary in summaries(verdict).items():
         at = plain_errors(verdict, name)
         means = [number(at[error], ".1f") for error in ("plane", "height", "pitch")]
