@@ -81,9 +81,8 @@ def run_evaluate(args: Evaluate) -> None:
         cells = cells_of(columns)
         result = report.matrix_report(cells, plan.differs, plan.world)
         if out is not None:
-            facts = {"config": {"flags": as_table(args)}, "environment": made_with}
-            command = as_command("hector evaluate", args)
-            result = report.write_matrix_report(out, cells, result | facts, command)
+            result |= {"config": {"flags": as_table(args)}, "environment": made_with}
+            report.write_matrix_report(out, cells, result, as_command("hector evaluate", args))
     world = next(iter(plan.engines.values())).title if args.walker else args.world
     print_text = partial(report.print_matrix, cells, result["claims"])
     if len(columns) == 1:

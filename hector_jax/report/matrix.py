@@ -131,8 +131,8 @@ def matrix_report(cells: Cells, differs: Mapping[str, str], world: str) -> dict[
 
 def write_matrix_report(
     folder: Path, cells: Cells, result: Mapping[str, Any], command: str
-) -> dict[str, Any]:
-    """Write report.md, verdict.json and verdict.png; return the content of verdict.json.
+) -> None:
+    """Write report.md, verdict.json and verdict.png.
 
     Args:
         folder: output folder.
@@ -152,6 +152,5 @@ def write_matrix_report(
         count=len(matrix.columns_of(cells)),
         walks=sum(len(v.scores) * v.walks for v in cells.values()),
     )
-    write_json(folder / "verdict.json", dict(result))
+    write_json(folder / "verdict.json", result)
     write_file(folder / "report.md", text.encode())
-    return dict(result)
