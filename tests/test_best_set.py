@@ -78,7 +78,7 @@ def test_best_is_tuned_with_numbers_of_its_own_and_smoothly_where_asked():
     assert at.others == {**BEST_OTHERS, "position_limit": 0.05, "footstep_width": 0.09}
     before = alphas(CONFIG.loss)
     assert alphas(config.loss) == {**before, "L_between": 3.0 * before["L_ctrl"]}
-    assert config.others == (*GROUPS["integral"], "turn_lead")
+    assert config.others == GROUPS["integral"]
     assert config.rollout == CONFIG.rollout
     jax.tree.map(np.testing.assert_array_equal, at[:2], start[:2])
 

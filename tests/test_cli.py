@@ -232,7 +232,7 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     assert [*dict.fromkeys(line["set"] for line in lines)] == ["without", "with", "best"]
     best = load_weights(run / "weights" / "best.json")
     assert best.others == {**best.others, **BEST_OTHERS}
-    assert best.others.keys() == {*BEST_OTHERS, *GROUPS["integral"], "turn_lead"}
+    assert best.others.keys() == {*BEST_OTHERS, *GROUPS["integral"]}
     start, *steps = result["walks"]
     assert start == {"change": 0.0, "falls": 0, "accepted": True}
     assert 1 <= len(steps) <= 3  # of the four sets of the budget

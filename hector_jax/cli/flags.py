@@ -182,7 +182,7 @@ class Tune(Configured, ByWalker, Parallel):
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
     start: Weights = "nominal"  # where to start: nominal, expert, best or a weights file
     # weights: Q and R; also footsteps, integral, all, or numbers by name;
-    # `best` has the gains of the integral action and turn_lead in any case
+    # `best` has the gains of the integral action in any case
     tune: tuple[Tunables, ...] = ("weights",)
     seeds: Plants = 8  # stand-in plants to evaluate on
     iterations: Annotated[int, Range(1, 10_000)] = 10  # largest number of steps of each tuning

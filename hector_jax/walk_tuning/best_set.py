@@ -71,7 +71,7 @@ def settings_of_best(
 ) -> tuple[TuneConfig, Weights]:
     """Return settings and start of the tuning of `best` from those of `without` and `with`.
 
-    It tunes the gains of the integral action too, and how far ahead steps turn.
+    It tunes the gains of the integral action too.
 
     Args:
         config, robot, start: of those tunings.
@@ -79,8 +79,7 @@ def settings_of_best(
         safe: limit of the position error [m]; None: the controller's, else `LIMIT`.
     """
     walk = config.rollout.walk
-    lead = ("turn_lead",) * (walk.footstep.rule != "paper")
-    others = tuple(dict.fromkeys((*config.others, *GROUPS["integral"], *lead)))
+    others = tuple(dict.fromkeys((*config.others, *GROUPS["integral"])))
     limit = safe or walk.mpc.position_limit or round(LIMIT * float(robot.standing_height), 3)
     numbers = {
         "position_limit": limit,
