@@ -25,10 +25,11 @@ from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, no_samples
 from hector_jax.core.tree_file import named_leaves, save_tree
+from hector_jax.own import walk_log
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import loss_of_robot
-from hector_jax.walk_tuning import added_logs, walk_log, walks
+from hector_jax.walk_tuning import added_logs, walks
 
 SECONDS = 0.1
 SPEEDS = {"ahead": (0.5, 0.0), "aside": (0.0, 0.5), "back": (-0.5, 0.0)}

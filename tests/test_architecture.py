@@ -12,7 +12,7 @@ import hector_jax
 
 ROOT = Path(__file__).parents[1] / "hector_jax"
 METHOD = "core robot qp control sim grfm tuning".split()
-APPLICATION = "importing store verdict walk_tuning export report cli __main__".split()
+APPLICATION = "importing own store verdict walk_tuning export report cli __main__".split()
 FLOOR = {room: height for height, room in enumerate([*METHOD, *APPLICATION])}
 DOORS = {"mujoco": ("core.headless", "sim.mjx_model"), "pydrake": ("sim.drake",)}
 DOORS |= {"pinocchio": ("sim.pinocchio",), "coal": ("sim.pinocchio",)}

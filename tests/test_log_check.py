@@ -16,13 +16,13 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.core.geometry import euler_rates, rotation_from_euler
 from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import named_leaves
+from hector_jax.own.log_check import check_log, read_check
+from hector_jax.own.parity import compare_plans
+from hector_jax.own.walk_file import read_walk
 from hector_jax.robot.kinematics import foot_poses, inverse_legs
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.diagnosis import record_walk
-from hector_jax.sim.log_check import check_log, read_check
 from hector_jax.sim.loop import Job
-from hector_jax.sim.parity import compare_plans
-from hector_jax.sim.walk_file import read_walk
 from hector_jax.sim.world import hfs, named_world
 
 SECONDS, TICK = 2.0, 0.01

@@ -24,10 +24,11 @@ from hector_jax.control.weights_file import save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import named_leaves
+from hector_jax.own.program import program_of
+from hector_jax.own.walk_file import read_walk
+from hector_jax.own.walker import Walker, walker_engine
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
-from hector_jax.sim.walk_file import read_walk
-from hector_jax.sim.walker import walker_engine, walker_of
 from hector_jax.sim.world import hfs
 
 ROOT = Path(__file__).parents[1]
@@ -63,9 +64,13 @@ def program(folder, text=WRITE):
     return path
 
 
+def engine(path, limit=20.0, uses=(), strict=True):
+    return walker_engine(Walker(program_of(path, limit, uses), strict))
+
+
 def walked(path, limit=20.0, **changes):
     job = Job(nominal(ROBOT), AHEAD, hfs(ROBOT.description), SECONDS)._replace(**changes)
-    return next(walker_engine(walker_of(path, limit)).walk(None, CONFIG, ROBOT, [job]))
+    return next(engine(path, limit).walk(None, CONFIG, ROBOT, [job]))
 
 
 @pytest.fixture
@@ -165,11 +170,9 @@ def test_a_program_that_makes_no_walk_is_told_in_one_line(tmp_path, text, told):
 
 
 def test_in_a_tuning_a_walk_that_is_not_made_is_a_fall(tmp_path, capsys):
-    walker = walker_of(program(tmp_path, "raise SystemExit('no solver')"), 20.0)._replace(
-        strict=False
-    )
+    walker = engine(program(tmp_path, "raise SystemExit('no solver')"), strict=False)
     job = Job(nominal(ROBOT), AHEAD, hfs(ROBOT.description), SECONDS)
-    walk = next(walker_engine(walker).walk(None, CONFIG, ROBOT, [job]))
+    walk = next(walker.walk(None, CONFIG, ROBOT, [job]))
     assert walk.fallen.all()
     assert "ended with code 1: no solver; counts as a fall" in capsys.readouterr().err
 
@@ -199,9 +202,9 @@ CALL = """
 import sys
 from pathlib import Path
 from hector_jax.core.console import exit_code
-from hector_jax.sim.walker import _call, walker_of
-walker = walker_of(Path(sys.argv[1]), 60.0)
-sys.exit(exit_code("toy", lambda: _call(walker, Path("request"), Path("log"))))
+from hector_jax.own.program import program_of, run
+walker = program_of(Path(sys.argv[1]), 60.0)
+sys.exit(exit_code("toy", lambda: run(walker, Path("request"), Path("log"))))
 """
 
 
@@ -231,16 +234,16 @@ SHOW = """
 import os, sys
 from pathlib import Path
 from hector_jax.core.runtime import setup_jax, workers
-from hector_jax.sim.walker import _call, walker_of
+from hector_jax.own.program import program_of, run
 if __name__ == "__main__":
     os.sched_setaffinity(0, {int(sys.argv[2])})
     setup_jax()
-    call = walker_of(Path(sys.argv[1]), 60.0), Path("request")
+    call = program_of(Path(sys.argv[1]), 60.0), Path("request")
     os.sched_setaffinity(0, range(64))
-    _call(*call, Path("here"))
+    run(*call, Path("here"))
     os.sched_setaffinity(0, {int(sys.argv[2])})
     with workers(1) as pool:
-        pool.submit(_call, *call, Path("there")).result()
+        pool.submit(run, *call, Path("there")).result()
 """
 
 
@@ -289,14 +292,14 @@ def test_what_cannot_be_a_walker_is_refused(tmp_path):
     (tmp_path / "no.sh").write_text("#!/bin/sh\n")
     for name, told in (("gone.py", "no such file"), ("no.sh", r"chmod \+x")):
         with pytest.raises(InputError, match=told):
-            walker_of(tmp_path / name, 1.0)
+            program_of(tmp_path / name, 1.0)
     with pytest.raises(InputError, match="has a robot of its own: Job.plant must be None"):
         walked(program(tmp_path), plant=ROBOT)
 
 
 def test_walks_of_another_program_have_another_key(tmp_path):
     texts = (WRITE, WRITE, WRITE + "#")
-    one, same, other = (walker_engine(walker_of(program(tmp_path, x), 1.0)).key for x in texts)
+    one, same, other = (engine(program(tmp_path, x)).key for x in texts)
     assert one == same != other
     assert one != MUJOCO_C._replace(name="mine.py").key
 
@@ -318,7 +321,7 @@ def test_walks_are_known_by_what_makes_them(tmp_path, file, same):
     def key(folder, content, limit=1.0):
         (folder / file).write_text(content)
         uses = (folder / "lib", folder / "plant.bin")
-        return walker_engine(walker_of(folder / "mine.py", limit, uses)).key
+        return engine(folder / "mine.py", limit, uses).key
 
     names = "notes.py lib/__pycache__/a.pyc gains.py model/inner/part.py lib/gains.yaml plant.bin"
     for path in map((tmp_path / "one").joinpath, names.split()):
@@ -330,7 +333,7 @@ def test_walks_are_known_by_what_makes_them(tmp_path, file, same):
     assert one == key(tmp_path / "two", "", limit=2.0)
     assert (one == key(tmp_path / "two", "a = 1")) == same
     with pytest.raises(InputError, match=r"walker-uses .*gone: no such file or folder"):
-        walker_of(tmp_path / "one" / "mine.py", 1.0, (tmp_path / "gone",))
+        program_of(tmp_path / "one" / "mine.py", 1.0, (tmp_path / "gone",))
 
 
 def test_the_example_walks_by_a_controller_of_its_own():

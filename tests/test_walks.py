@@ -30,6 +30,7 @@ from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import save_tree
+from hector_jax.own import walk_log
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
@@ -38,7 +39,7 @@ from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import loss_of
-from hector_jax.walk_tuning import added_logs, walk_log, walks
+from hector_jax.walk_tuning import added_logs, walks
 from hector_jax.walk_tuning import campaign as campaigns
 from hector_jax.walk_tuning.best_set import drawn_plants
 

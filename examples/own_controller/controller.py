@@ -42,6 +42,13 @@ def rot_z(yaw: float) -> np.ndarray:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
+def rotation(euler: np.ndarray) -> np.ndarray:
+    """Return the rotation of roll, pitch and yaw [rad]."""
+    (cr, cp, _), (sr, sp, _) = np.cos(euler), np.sin(euler)
+    tilt = np.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
+    return rot_z(euler[2]) @ tilt
+
+
 def wrap(angle: float) -> float:
     """Return the angle [rad] within half a turn."""
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
@@ -154,12 +161,8 @@ class Controller:
 
     def swing(self, time: float, x: np.ndarray, foot: int) -> tuple[np.ndarray, np.ndarray]:
         """Return where a foot in the air should be, and its speed: x, y, z, pitch, yaw."""
-        since = (time + IN_PLACE + 1e-9) % STEP
-        s, travel = since / STEP, STEP - since + 0.5 * STEP
-        velocity, rate = self.wanted(time)
-        yaw, start = x[2] + rate * travel, self.lift[foot]
-        end = x[3:6] + rot_z(yaw) @ [0.0, WIDTH * (1 - 2 * foot), 0.0] + x[9:12] * travel
-        end = end + FEEDBACK * (x[9:12] - rot_z(x[2]) @ velocity)
+        s, start = (time + IN_PLACE + 1e-9) % STEP / STEP, self.lift[foot]
+        end, yaw = self.foothold(time, x, foot)
         way = np.array([*(end - start[:3]), 0.0, wrap(yaw - start[3])])
         share, slope = smooth(s)
         target = np.array([*start[:3], 0.0, start[3]]) + share * way
@@ -170,9 +173,18 @@ class Controller:
         speed[2] = np.sign(0.5 - s) * 2.0 * climb / STEP * (APEX - floor)
         return target, speed
 
+    def foothold(self, time: float, x: np.ndarray, foot: int) -> tuple[np.ndarray, float]:
+        """Return the next foothold of a foot (3,), and its yaw; its height does not count."""
+        travel = STEP - (time + IN_PLACE + 1e-9) % STEP + 0.5 * STEP
+        velocity, rate = self.wanted(time)
+        yaw = x[2] + rate * travel
+        end = x[3:6] + rot_z(yaw) @ [0.0, WIDTH * (1 - 2 * foot), 0.0] + x[9:12] * travel
+        return end + FEEDBACK * (x[9:12] - rot_z(x[2]) @ velocity), yaw
+
     def plan(self, time: float, x: np.ndarray, feet: np.ndarray, yaws: np.ndarray) -> np.ndarray:
         """Solve the MPC; return force and moment of the ground on each foot now (2, 6)."""
-        (_, pitch, yaw), axes = x[:3], self.data.xmat[1].reshape(3, 3)
+        pitch, yaw = x[1:3]
+        axes = rotation(x[:3])
         A, B = np.eye(13), np.zeros((13, 12))
         A[:3, 6:9] = MPC_STEP * rot_z(yaw).T
         A[:3, 6:9] = np.diag([1 / np.cos(pitch), 1, 1]) @ A[:3, 6:9]

@@ -23,12 +23,13 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import to_table
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree_file import ROBOT_DIGITS, read_card, tree_hash
+from hector_jax.own.program import program_of
+from hector_jax.own.walker import Walker, walker_engine
 from hector_jax.robot.description import Description
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.sim.engine import MUJOCO_C, Engine, choose_engine
 from hector_jax.sim.loop import Job, check_plant
 from hector_jax.sim.standin import FAMILIES
-from hector_jax.sim.walker import walker_engine, walker_of
 from hector_jax.sim.world import Imperfections, named_world
 from hector_jax.store.cache import robot_hash
 from hector_jax.store.folder import RunRequest
@@ -62,12 +63,9 @@ def engine_of(args: Evaluate | Tune | Walk) -> Engine:
         if hasattr(args, name) and args.is_given(name):
             text = f"--{name.replace('_', '-')} is for this project's controller and simulators"
             raise InputError(f"{text}, so not beside --walker")
-    walker = walker_of(args.walker, args.walker_limit, args.walker_uses)
-    if isinstance(args, Tune):  # it goes on over night
-        walker = walker._replace(strict=False)
-    elif isinstance(args, Walk):
-        walker = walker._replace(log=args.out)
-    return walker_engine(walker)
+    program = program_of(args.walker, args.walker_limit, args.walker_uses)
+    strict = not isinstance(args, Tune)  # which goes on over night
+    return walker_engine(Walker(program, strict, args.out if isinstance(args, Walk) else None))
 
 
 def short_names(texts: Sequence[str]) -> dict[str, str]:

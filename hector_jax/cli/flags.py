@@ -203,6 +203,8 @@ class Tune(Configured, ByWalker, Parallel):
     # drawn plants of these walks, 0 for the simulator; by default twelve, or as --walks allows
     walk_plants: Annotated[int | None, Range(0, 1000)] = None
     walk_engine: WalkEngine = "c"  # of these walks; c: MuJoCo; extras: drake, pinocchio
+    # program that plans as --walker does, which slopes come from, not from [twin]
+    planner: Annotated[Path | None, PathKind.FILE] = None
     json: bool = False  # print JSON instead of the table; `run` is the folder
     robot: RobotFile = None  # TOML file of another robot, with its data in DATA/NAME; or HECTOR
 

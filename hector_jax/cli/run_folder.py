@@ -42,7 +42,12 @@ _CALL_FLAGS = ("config", "out", "resume")
 # flags that may change when a run is resumed
 _FREE_FLAGS = (
     *("cluster", "data", "json", "processes", "video"),
-    *("walker", "walker_limit", "walker_uses"),  # the record of its walks tells what it is
+    *(
+        "walker",
+        "walker_limit",
+        "walker_uses",
+        "planner",
+    ),  # the record of its walks tells what it is
 )
 # flags that say nothing to a program of the user
 _OF_OUR_CONTROLLER = "alpha data iterations net safe smooth variant".split()
@@ -77,6 +82,8 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
 def _check_walker(args: Tune) -> None:
     """Raise an InputError if the flags of a tuning do not go with a program of the user."""
     if args.walker is None:
+        if args.planner:
+            raise InputError("--planner plans for the walks of a --walker, which is not given")
         return
     if not args.walks:
         raise InputError("--walker needs --walks, the number of its walks that a tuning may take")

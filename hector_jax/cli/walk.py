@@ -26,6 +26,7 @@ from hector_jax.grfm import training
 from hector_jax.grfm.dataset import at_interval, make_dataset
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect
+from hector_jax.own.walk_log import walk_card
 from hector_jax.report import fidelity, pictures
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
@@ -38,7 +39,6 @@ from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import Loss, loss_of_robot
 from hector_jax.verdict import judging, metrics
-from hector_jax.walk_tuning.walk_log import walk_card
 
 
 def _check_world(args: Walk) -> None:

@@ -17,13 +17,14 @@ from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
 from hector_jax.core.trajectory import FEET
+from hector_jax.own.log_check import check_log, read_check
+from hector_jax.own.parity import COMPONENTS, Parity, compare_plans
+from hector_jax.own.program import program_of
+from hector_jax.own.walk_file import read_walk
+from hector_jax.own.walker import write_log
 from hector_jax.report.report import first_lines, print_tables
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.sim.log_check import check_log, read_check
 from hector_jax.sim.loop import Job
-from hector_jax.sim.parity import COMPONENTS, Parity, compare_plans
-from hector_jax.sim.walk_file import read_walk
-from hector_jax.sim.walker import walker_of, write_log
 from hector_jax.sim.world import hfs
 from hector_jax.store import tunings
 from hector_jax.store.folder import RESULT
@@ -120,6 +121,7 @@ def tune_walker(folder: Path, args: Tune) -> None:
         commands,
         best_set.walk_plants(robot, args.walk_plants, args.walks, len(commands))[0],
         arguments.engine_of(args),
+        args.planner and program_of(args.planner, args.walker_limit, args.walker_uses),
     )
     _check_first(args, campaign, seconds)
     with workers(args.processes, args.cluster) as pool:
@@ -158,7 +160,7 @@ def _check_first(args: Tune, campaign: Campaign, seconds: float) -> None:
     walk = campaign.config.rollout.walk
     with TemporaryDirectory() as folder:
         path = Path(folder) / "first.npz"
-        write_log(walker_of(args.walker, args.walker_limit), job, path)
+        write_log(program_of(args.walker, args.walker_limit), job, path)
         try:
             log, end = read_check(path, campaign.robot, command, seconds, walk.gait.tick)
         except InputError as error:

@@ -3,7 +3,7 @@
 A controller that shares the MPC of `mpc` may predict otherwise: from another reference, with a
 frozen linearisation, with contacts looked up elsewhere in a step, in plans of several ticks, with
 another mass. Each is a part or a number of `TwinConfig`, the section [twin] of the robot's file;
-the defaults are the MPC of this project. `sim.parity` says how far the plans of both are apart.
+the defaults are the MPC of this project. `own.parity` says how far the plans of both are apart.
 """
 
 from collections.abc import Callable

@@ -21,7 +21,7 @@ from hector_jax.core.runtime import start_worker
 
 _PATIENCE = 5.0  # [s] for a scheduler to answer
 # modules of the jobs
-_CODE = "store.tunings verdict.judging walk_tuning.walks sim.walker sim.drake sim.pinocchio".split()
+_CODE = "store.tunings verdict.judging walk_tuning.walks own.walker sim.drake sim.pinocchio".split()
 
 _Versions = tuple[tuple[str, str], ...]
 

@@ -5,6 +5,7 @@ errors and its gradient is that along the walk (Eq. 9, 10). With weights nearby 
 walk by what the model predicts: good for some steps, then another walk is needed.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -13,7 +14,8 @@ import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from hector_jax import qp
-from hector_jax.control.controller import measured_feet
+from hector_jax.control import parameters
+from hector_jax.control.controller import Plan, measured_feet
 from hector_jax.control.footstep import Feet
 from hector_jax.control.legs import Measurement
 from hector_jax.control.reference import Anchor, anchor_at
@@ -22,6 +24,7 @@ from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.trajectory import Disturbance, State, Trajectory, Wrench, has_fallen
 from hector_jax.robot.model import Robot
+from hector_jax.tuning.called import CalledPlans
 from hector_jax.tuning.rollout import Carry, RolloutConfig, Scenario, command_history, step_carry
 
 
@@ -57,6 +60,22 @@ class Grounding(NamedTuple):
     errors: MeasuredState  # (T - 1, ...) estimated less true values at the start of a tick
     # (T - 1, ...) measured less modelled values at the end of a tick, in the yaw frame at its start
     residuals: MeasuredState
+    weights: Weights  # of the walk
+    called: CalledPlans | None = None  # (T - 1, ...) of another controller; None: this project's
+
+
+def begins_of_ticks(robot: Robot, walk: Trajectory) -> tuple[MeasuredState, MeasuredState]:
+    """Return true and estimated states when a walk of T ticks planned for all but the first.
+
+    Args:
+        robot: the nominal body.
+        walk: see `fit_grounding`.
+    """
+    assert walk.belief is not None  # zero in a log without it
+    begins = jax.tree.map(lambda x: x[:-1], (walk.state, walk.joints))
+    errors = jax.tree.map(lambda x: x[1:], walk.belief[:2])
+    estimated = jax.tree.map(jnp.add, begins, errors)
+    return measured_states(robot, *begins), measured_states(robot, *estimated)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -66,6 +85,8 @@ def fit_grounding(
     weights: Weights,
     walk: Trajectory,
     start_tick: Int[Array, ""] | int = 0,
+    *,
+    called: CalledPlans | None = None,
 ) -> Grounding:
     """Compute the residuals of the model along a walk.
 
@@ -76,6 +97,7 @@ def fit_grounding(
         walk: true states, joints, commands and what the controller believed, sampled at the plan
             interval: T samples.
         start_tick: gait tick of t = 0.
+        called: plans of another controller for all ticks but the first; None: this project's.
 
     Raises:
         ValueError: the walk has another number of ticks, from `jax.lax.scan`.
@@ -84,28 +106,38 @@ def fit_grounding(
     """
     robot, belief = scenario.robot, walk.belief
     assert belief is not None  # zero in a log without it
-    true = measured_states(robot, walk.state, walk.joints)
-    first, command_before = jax.tree.map(lambda x: x[0], (true, walk.command))
     anchor, tick = anchor_at(robot, walk.initial, start_tick), jnp.asarray(start_tick) + 1
-    begins, ends = jax.tree.map(lambda x: x[:-1], true), jax.tree.map(lambda x: x[1:], true)
-    begin_joints, (state, joints) = walk.joints[:-1], jax.tree.map(lambda x: x[1:], belief[:2])
-    estimated = jax.tree.map(jnp.add, begins.state, state)
-    errors = jax.tree.map(
-        jnp.subtract, measured_states(robot, estimated, begin_joints + joints), begins
-    )
+    begins, estimated = begins_of_ticks(robot, walk)
+    errors = jax.tree.map(jnp.subtract, estimated, begins)
+    first, command_before = jax.tree.map(lambda x: x[0], (begins, walk.command))
+    ends = measured_states(robot, *jax.tree.map(lambda x: x[1:], (walk.state, walk.joints)))
 
     def step(memory: tuple[Wrench, Disturbance], inputs: tuple) -> tuple[tuple, MeasuredState]:
-        begin, end, error, tick = inputs
+        begin, end, error, tick, row = inputs
         carry = carry_from(begin, anchor, *memory)
-        after, _ = step_carry(config, scenario, weights, carry, tick, error=error)
+        planner = _planner(row, carry, weights, weights)
+        options = {"error": error, "planner": planner}
+        after, _ = step_carry(config, scenario, weights, carry, tick, **options)
         residual = jax.tree.map(jnp.subtract, end, MeasuredState(after.state, after.feet))
         return (after.commands, after.disturbance), _turned(residual, -begin.state.euler[2])
 
     disturbance = jax.tree.map(lambda x: x[0], belief.disturbance)
-    memory, ticks = (command_history(command_before), disturbance), tick + jnp.arange(len(joints))
-    _, residuals = jax.lax.scan(step, memory, (begins, ends, errors, ticks))
-    start = carry_from(first, anchor, *memory)
-    return Grounding(scenario._replace(anchor=anchor), start, tick, errors, residuals)
+    memory = command_history(command_before), disturbance
+    ticks = tick + jnp.arange(len(ends.feet.yaw))
+    _, residuals = jax.lax.scan(step, memory, (begins, ends, errors, ticks, called))
+    start, scenario = carry_from(first, anchor, *memory), scenario._replace(anchor=anchor)
+    return Grounding(scenario, start, tick, errors, residuals, weights, called)
+
+
+def _planner(
+    called: CalledPlans | None, carry: Carry, start: Weights, weights: Weights
+) -> Callable[..., Plan] | None:
+    """Return what plans in a tick: another controller, called with `start`; None: this one."""
+    if called is None:
+        return None
+    steps = parameters.steps_between(start, weights, tuple(start.others))
+    last = jax.tree.map(lambda x: x[0], carry.commands)
+    return partial(called.plan, steps=steps, last=last, disturbance=carry.disturbance)
 
 
 def _turned(x: MeasuredState, yaw: Float[Array, ""]) -> MeasuredState:
@@ -129,12 +161,13 @@ def grounded_rollout(config: RolloutConfig, grounding: Grounding, weights: Weigh
 
     Source: Eq. 12, 13 and the measured residuals.
     """
-    scenario, start, tick, errors, residuals = grounding
+    scenario, start, tick, errors, residuals, walked, called = grounding
 
     @partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(qp.SAVED))
     def step(carry: Carry, inputs: tuple) -> tuple[Carry, Trajectory]:
-        error, residual, tick = inputs
-        after, sample = step_carry(config, scenario, weights, carry, tick, error=error)
+        error, residual, tick, row = inputs
+        options = {"error": error, "planner": _planner(row, carry, walked, weights)}
+        after, sample = step_carry(config, scenario, weights, carry, tick, **options)
         residual = _turned(residual, carry.state.euler[2])
         state, feet = jax.tree.map(jnp.add, MeasuredState(after.state, after.feet), residual)
         fallen = carry.fallen | has_fallen(state, *scenario.robot.description.limits)
@@ -142,5 +175,5 @@ def grounded_rollout(config: RolloutConfig, grounding: Grounding, weights: Weigh
         return after, sample._replace(state=state, feet=feet.position, fallen=fallen)
 
     ticks = tick + jnp.arange(len(residuals.feet.yaw))
-    _, samples = jax.lax.scan(step, start, (errors, residuals, ticks))
+    _, samples = jax.lax.scan(step, start, (errors, residuals, ticks, called))
     return samples._replace(initial=start.state, period=jnp.asarray(config.walk.gait.tick))

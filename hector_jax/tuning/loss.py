@@ -112,6 +112,18 @@ def changes_between(trajectory: Trajectory) -> Float[Array, "changes feet 6"]:
     return jnp.where(_switched(trajectory), 0.0, command_changes(trajectory))
 
 
+def tilt_error(trajectory: Trajectory) -> Float[Array, "T 3"]:
+    """Return the error of roll and pitch [rad] for sums over 1 kHz samples."""
+    error = trajectory.state.euler - trajectory.reference.euler
+    return _tracking(trajectory, error * jnp.array([1.0, 1.0, 0.0]), FALL_EULER)
+
+
+def height_error(trajectory: Trajectory) -> Float[Array, "T 3"]:
+    """Return the error of the height [m] for sums over 1 kHz samples."""
+    error = trajectory.state.position - trajectory.reference.position
+    return _tracking(trajectory, error * jnp.array([0.0, 0.0, 1.0]), FALL_POSITION)
+
+
 def velocity_error(trajectory: Trajectory) -> Float[Array, "T 3"]:
     """Return the error of the velocity ahead and aside [m/s] for sums over 1 kHz samples.
 
@@ -139,11 +151,14 @@ PAPER_LOSS: Loss = (
 """The loss of the paper. Source: Eq. 11."""
 
 OPTIONAL_TERMS: Loss = (
+    LossTerm("L_tilt", "rad^2", 0.0, tilt_error),
+    LossTerm("L_height", "m^2", 0.0, height_error),
     LossTerm("L_vel", "m^2/s^2", 0.0, velocity_error),
     LossTerm("L_yaw_rate", "rad^2/s^2", 0.0, yaw_rate_error),
 )
-"""Terms that a robot's description may add, for a controller whose reference starts at the robot in
-each plan: it cannot know where it should be, but how fast."""
+"""Terms that a robot's description may have in place of the paper's, for a controller whose
+reference starts at the robot in each plan: it knows how upright, how high and how fast it should
+be, but neither where nor which way it should face."""
 
 
 def losses(loss: Loss, trajectory: Trajectory) -> Terms:

@@ -5,6 +5,7 @@ of the ground and moves the body; its only memory is `Carry`. A foot in the air 
 touchdown that phi predicts, and an early touchdown that phi predicts acts there.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -206,12 +207,14 @@ def step_carry(
     *,
     wrench: Wrench | None = None,
     error: tuple[State, Feet] | None = None,
+    planner: Callable[..., Plan] | None = None,
 ) -> tuple[Carry, Trajectory]:
     """Walk one tick of the closed loop: plan, effect, motion.
 
     Returns the next carry and the tick's sample of the trajectory. A `wrench` takes the place of
     the planned one, and `error` is that of the estimated state and feet in place of a variation's.
-    The anchor is that of the carry.
+    A `planner` of `state` and `feet` plans in place of this controller. The anchor is that of the
+    carry.
     """
     robot, command, _, effect, variation = scenario
     walk, dt = config.walk, config.walk.gait.tick
@@ -220,19 +223,20 @@ def step_carry(
     state, feet, drift = _estimate(carry, tick, variation)
     if error is not None:
         state, feet = jax.tree.map(jnp.add, (carry.state, carry.feet), tuple(error))
-    planned = plan(
-        walk,
-        robot,
-        walk.parameters(weights),
-        command=command,
-        anchor=anchor,
-        tick=tick,
-        state=state,
-        feet=feet,
-        disturbance=carry.disturbance,
-        last=jax.tree.map(lambda w: w[0], carry.commands),
-        max_contacts=contacts_needed(walk, 0),
-    )
+    if planner is None:
+        planner = partial(
+            plan,
+            walk,
+            robot,
+            walk.parameters(weights),
+            command=command,
+            anchor=anchor,
+            tick=tick,
+            disturbance=carry.disturbance,
+            last=jax.tree.map(lambda w: w[0], carry.commands),
+            max_contacts=contacts_needed(walk, 0),
+        )
+    planned = planner(state=state, feet=feet)
     planned = planned if wrench is None else planned._replace(wrench=wrench)
     commands = jax.tree.map(
         lambda new, old: jnp.concatenate([new[None], old[:-1]]), planned.wrench, carry.commands

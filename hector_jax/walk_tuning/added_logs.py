@@ -20,9 +20,9 @@ from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import tree_hash
+from hector_jax.own.walk_log import ScoredLog, evaluate_log, read_log
 from hector_jax.walk_tuning import walks
 from hector_jax.walk_tuning.campaign import Campaign
-from hector_jax.walk_tuning.walk_log import ScoredLog, evaluate_log, read_log
 from hector_jax.walk_tuning.walks import WalkTuning
 
 _MOST = 10_000  # iterations: a person ends the tuning

@@ -1,6 +1,5 @@
-"""The settings of a tuning on walks, and what identifies the robot of a walk."""
+"""The settings of a tuning on walks."""
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -11,6 +10,7 @@ import numpy as np
 
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights
+from hector_jax.own.program import Program
 from hector_jax.robot.model import Robot
 from hector_jax.sim.engine import MUJOCO_C, Engine
 from hector_jax.sim.world import Imperfections
@@ -28,6 +28,7 @@ class Campaign:
     commands: Mapping[str, Command]
     plants: Sequence[Imperfections | None] = (None,)  # None: the walks are made elsewhere
     engine: Engine = MUJOCO_C
+    planner: Program | None = None  # of the user, whose slopes are taken; None: the robot's file
 
     def __post_init__(self) -> None:
         start = jax.tree.map(np.asarray, init(self.config, self.start).start)
@@ -47,15 +48,3 @@ class Campaign:
     def seconds(self) -> float:
         """Length of a walk."""
         return self.config.rollout.ticks * self.config.rollout.walk.gait.tick
-
-
-def walker_hash(robot: Robot) -> str:
-    """Return a hash (16 hexadecimal digits) of what of a robot's files makes a walk.
-
-    What only begins or judges one may change: weights, loss, limits of a fall, plants.
-    """
-    d = robot.description
-    feet = tuple(map(tuple, d.feet))
-    control = [section for section in d.control if section[0] != "twin"]
-    parts = d.standing, d.joints, d.linkage, d.weld, d.armature, feet, tuple(control)
-    return hashlib.sha256(repr(parts).encode() + d.model.read_bytes()).hexdigest()[:16]

@@ -39,6 +39,8 @@ from hector_jax.core.journal import continue_journal, write_rows
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
 from hector_jax.grfm import network
+from hector_jax.own.planner import called_plans
+from hector_jax.own.walk_log import Log, ScoredLog, evaluate_log, log_of, trajectory_of, walker_hash
 from hector_jax.sim.loop import Job
 from hector_jax.store.cache import content_key, robot_hash
 from hector_jax.tuning import difftune
@@ -48,8 +50,7 @@ from hector_jax.tuning.evaluate import Evaluation, Objective
 from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
 from hector_jax.tuning.rollout import Scenario
 from hector_jax.tuning.status import StepStatus
-from hector_jax.walk_tuning.campaign import Campaign, walker_hash
-from hector_jax.walk_tuning.walk_log import Log, ScoredLog, evaluate_log, log_of, trajectory_of
+from hector_jax.walk_tuning.campaign import Campaign
 
 RECORD = "walks.jsonl"
 START_PLANTS = 3  # on which several starts walk
@@ -127,7 +128,11 @@ def _slope(
     config, robot = campaign.config, campaign.robot
     effect = network.effect_of(None, config.rollout.walk)
     scenario = Scenario(robot, campaign.cases[case][1], standing_anchor(robot), effect)
-    grounding = fit_grounding(config.rollout, scenario, weights, trajectory_of(log))
+    walk, called = trajectory_of(log), None
+    if campaign.planner is not None:
+        inputs = config.rollout.walk, robot, weights, scenario.command, walk
+        called = called_plans(campaign.planner, *inputs)
+    grounding = fit_grounding(config.rollout, scenario, weights, walk, called=called)
     inputs = config.rollout, grounding, weights, config.loss
     options = {"walk": grounded_rollout, "others": config.others}
     return jax.device_get(least_squares_jit(*inputs, **options))
@@ -311,6 +316,7 @@ def _head(campaign: Campaign) -> dict[str, Any]:
         "robot": robot_hash(campaign.robot),
         "settings": content_key(settings, campaign.start, code=()),
         "engine": campaign.engine.key,
+        "planner": campaign.planner and campaign.planner.content,
         "code": code_hash("walk_tuning.walks", *campaign.engine.modules),
     }
 

@@ -17,10 +17,10 @@ from hector_jax.control.reference import Command
 from hector_jax.core.geometry import euler_rates, rotation_from_euler
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import SOLVED, State, Trajectory
+from hector_jax.own.walk_file import check_legs, read_entries, read_walk, reference_of
 from hector_jax.robot.model import Robot
 from hector_jax.sim.diagnosis import FALLING, MOST_AT_LIMIT, STEADY, lasting, motors, steady_height
 from hector_jax.sim.leg_check import BETTER, legs_found, samples_of, slope
-from hector_jax.sim.walk_file import check_legs, read_entries, read_walk, reference_of
 
 SETTLED, SHORTEST = 0.5, 1.0  # [s] after t = 0; of a walk from then on
 LOADED = 0.2  # share of the weight on a foot that stands

@@ -1,5 +1,6 @@
 """Logs of walks of this simulator or of a robot: their entries, loading, card and loss."""
 
+import hashlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,11 +15,10 @@ from hector_jax.core.inputs import InputError, one_line
 from hector_jax.core.settings import convert
 from hector_jax.core.trajectory import SOLVED, Belief, State, Trajectory, Wrench, no_samples
 from hector_jax.core.tree_file import read_card, tree_hash
+from hector_jax.own.walk_file import read_walk, reference_of
 from hector_jax.robot.model import Robot
-from hector_jax.sim.walk_file import read_walk, reference_of
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import loss_of
-from hector_jax.walk_tuning.campaign import walker_hash
 
 
 class Log(NamedTuple):
@@ -59,6 +59,18 @@ def _at_ticks(log: Log, tick: float) -> Log:
     return jax.tree.map(lambda x: x[stride - 1 :: stride], samples)._replace(
         period=np.asarray(tick), initial=log.initial
     )
+
+
+def walker_hash(robot: Robot) -> str:
+    """Return a hash (16 hexadecimal digits) of what of a robot's files makes a walk.
+
+    What only begins or judges one may change: weights, loss, limits of a fall, plants.
+    """
+    d = robot.description
+    feet = tuple(map(tuple, d.feet))
+    control = [section for section in d.control if section[0] != "twin"]
+    parts = d.standing, d.joints, d.linkage, d.weld, d.armature, feet, tuple(control)
+    return hashlib.sha256(repr(parts).encode() + d.model.read_bytes()).hexdigest()[:16]
 
 
 def walk_card(

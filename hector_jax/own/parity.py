@@ -19,8 +19,8 @@ from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import SOLVED, Disturbance, Trajectory, Wrench
+from hector_jax.own.walk_file import check_legs
 from hector_jax.robot.model import Robot
-from hector_jax.sim.walk_file import check_legs
 
 COMPONENTS = ("F_x", "F_y", "F_z", "M_x", "M_y", "M_z")
 
