@@ -294,12 +294,13 @@ class Check(ForRobot, Printed):
 
 @_command
 class Twin(Check):
-    """Solve the plans of a log again, and say how far those of the robot's file are from them.
+    """Plan a log again, by the robot's file or by a program, and say how far these plans are off.
 
     Example: hector log twin mine.npz --robot mine.toml --traj straight --weights mine.json
     """
 
     weights: Weights = "nominal"  # with which the log was walked: a file, nominal, expert or best
+    planner: Annotated[Path | None, PathKind.FILE] = None  # program that plans, in place of a twin
 
 
 @_command

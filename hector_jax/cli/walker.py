@@ -19,8 +19,10 @@ from hector_jax.core.runtime import workers
 from hector_jax.core.trajectory import FEET
 from hector_jax.own.log_check import check_log, read_check
 from hector_jax.own.parity import COMPONENTS, Parity, compare_plans
+from hector_jax.own.planner import Calls, compare_calls
 from hector_jax.own.program import program_of
 from hector_jax.own.walk_file import read_walk
+from hector_jax.own.walk_log import at_ticks, log_of, trajectory_of
 from hector_jax.own.walker import write_log
 from hector_jax.report.report import first_lines, print_tables
 from hector_jax.robot.model import Robot, load_robot
@@ -33,6 +35,8 @@ from hector_jax.verdict import judging, metrics
 from hector_jax.walk_tuning import best_set
 from hector_jax.walk_tuning.campaign import Campaign
 from hector_jax.walk_tuning.walks import tune_on_walks
+
+_LIMIT = 600.0  # [s] of the calls of a log
 
 
 def run_check(args: Check) -> None:
@@ -47,16 +51,36 @@ def run_check(args: Check) -> None:
 
 
 def run_twin(args: Twin) -> None:
-    """Say how far the plans of a log are from those of the robot's file."""
+    """Say how far the plans of a log are from those of the robot's file, or of a program."""
     robot = load_robot(args.robot)
     config, trajectory = walk_config(robot), arguments.load_trajectory(args.traj, robot)
     seconds = arguments.walk_seconds(args, trajectory)
     walk, end = read_walk(args.log, robot, seconds, config.gait.tick)
     weights = arguments.weights_by_name(args.weights, robot)
-    parity = compare_plans(config, robot, weights, trajectory.command, walk)
+    inputs, calls = (config, robot, weights, trajectory.command), None
+    if args.planner:
+        ticks = trajectory_of(at_ticks(log_of(walk), config.gait.tick))
+        calls = compare_calls(program_of(args.planner, _LIMIT), *inputs, ticks)
+    parity = calls.parity if calls else compare_plans(*inputs, walk)
     result = _parity_result(parity) | {"ended": end}
-    lines = [*([end] if end else []), *_parity_lines(result, robot)]
+    lines = [*([end] if end else []), *_parity_lines(result, robot, args.planner)]
+    if calls:
+        result["calls"] = {name: x for name, x in calls._asdict().items() if name != "parity"}
+        lines += _call_lines(calls)
     print_result(args.json, result, lambda: print(*lines, sep="\n"))
+
+
+def _call_lines(calls: Calls) -> Iterator[str]:
+    """Return what of a planner a tuning cannot use."""
+    if calls.again > 1e-6:
+        text = "a second call at the same inputs differs by"
+        yield f"{text} {calls.again:.2g}: the plan has a memory, such as a warm start or a filter"
+    if calls.jumps:
+        yield f"{100 * calls.jumps:.0f} % of the plans jump when a state is moved by 0.1 mm"
+    if calls.idle:
+        yield f"no plan depends on {', '.join(calls.idle)}"
+    if not calls.steps:
+        yield "no touchdown depends on the velocity: a robot that steps so would fall"
 
 
 def _parity_result(parity: Parity) -> dict[str, Any]:
@@ -82,16 +106,16 @@ def _parity_result(parity: Parity) -> dict[str, Any]:
     }
 
 
-def _parity_lines(result: Mapping[str, Any], robot: Robot) -> Iterator[str]:
+def _parity_lines(result: Mapping[str, Any], robot: Robot, planner: Path | None) -> Iterator[str]:
     """Return the lines that `hector log twin` prints of its result."""
     yield f"{plural(result['plans'], 'plan')}; differences in N and N m, world frame"
     yield f"{'':5}" + "".join(f"{name:>10}" for name in result["differences"]["F_x"])
     for name, row in result["differences"].items():
         yield f"{name:5}" + "".join(f"{x:10.2g}" for x in row.values())
-    most = result["worst"]
+    most, other = result["worst"], planner.name if planner else "the twin"
     side = FEET[len(robot.foot_point)][most["foot"]].replace("_", " ")
     at = f"most at {most['at']:.3f} s, {side} foot, {most['component']}"
-    yield f"{at}: {most['logged']:.6g} in the log, {most['twin']:.6g} of the twin"
+    yield f"{at}: {most['logged']:.6g} in the log, {most['twin']:.6g} of {other}"
     by_log, largest = result["by_log"], max(x["worst"] for x in result["differences"].values())
     if by_log is not None and by_log < 0.9 * largest:
         yield f"from the reference in the log on, at most {by_log:.2g}: see [twin] reference"

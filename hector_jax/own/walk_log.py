@@ -52,7 +52,7 @@ def read_log(path: Path, robot: Robot, seconds: float, tick: float) -> Log:
     return log_of(read_walk(path, robot, seconds, tick)[0])
 
 
-def _at_ticks(log: Log, tick: float) -> Log:
+def at_ticks(log: Log, tick: float) -> Log:
     """Return the log at the end of each tick [s]."""
     stride = round(tick / float(log.period))
     samples = log._replace(period=None, initial=None)
@@ -160,4 +160,4 @@ def evaluate_log(config: TuneConfig, robot: Robot, command: Command, log: Log) -
     reference = reference_of(tick, robot, command, log)
     loss = float(loss_of(config.loss, trajectory_of(log)._replace(reference=reference)))
     failed = log.fallen.any() or not log.residual.max() <= SOLVED
-    return ScoredLog(np.inf if failed else loss, _at_ticks(log, tick))
+    return ScoredLog(np.inf if failed else loss, at_ticks(log, tick))

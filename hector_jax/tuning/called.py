@@ -31,6 +31,11 @@ STATE_STEPS = (1e-4, 1e-4, 1e-3, 1e-3)  # [rad], [m], [rad/s], [m/s] of the part
 FOOT_STEP, LOG_STEP = 1e-4, 0.02  # [m] of a foot; of a tuned number, see `parameters.stepped`
 
 
+def move_sizes(body: int) -> Float[np.ndarray, " body"]:
+    """Return by how much the numbers of state and feet are moved."""
+    return np.array([*np.repeat(STATE_STEPS, 3), *[FOOT_STEP] * (body - 12)])
+
+
 class PlanInputs(NamedTuple):
     """From what a controller plans: N plans of a walk."""
 
@@ -117,7 +122,7 @@ def call_along(
     """
     body, rows = np.asarray(_body(inputs.state, inputs.feet)), np.flatnonzero(made)
     feet, numbers = inputs.contact.shape[1], len(step_names(inputs.weights, others))
-    sizes = [*np.repeat(STATE_STEPS, 3), *[FOOT_STEP] * 3 * feet, *[LOG_STEP] * numbers]
+    sizes = np.append(move_sizes(body.shape[1]), np.full(numbers, LOG_STEP))
     moves = np.concatenate([np.zeros((1, len(sizes))), np.diag(sizes)])
     of_body, of_weights = np.split(moves, [body.shape[1]], axis=1)
 

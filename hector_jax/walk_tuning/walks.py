@@ -39,7 +39,7 @@ from hector_jax.core.journal import continue_journal, write_rows
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
 from hector_jax.grfm import network
-from hector_jax.own.planner import called_plans
+from hector_jax.own.planner import called_plans, plan_inputs
 from hector_jax.own.walk_log import Log, ScoredLog, evaluate_log, log_of, trajectory_of, walker_hash
 from hector_jax.sim.loop import Job
 from hector_jax.store.cache import content_key, robot_hash
@@ -130,8 +130,9 @@ def _slope(
     scenario = Scenario(robot, campaign.cases[case][1], standing_anchor(robot), effect)
     walk, called = trajectory_of(log), None
     if campaign.planner is not None:
-        inputs = config.rollout.walk, robot, weights, scenario.command, walk
-        called = called_plans(campaign.planner, *inputs)
+        controller = config.rollout.walk
+        inputs = plan_inputs(controller, robot, weights, scenario.command, walk)
+        called = called_plans(campaign.planner, controller, inputs)
     grounding = fit_grounding(config.rollout, scenario, weights, walk, called=called)
     inputs = config.rollout, grounding, weights, config.loss
     options = {"walk": grounded_rollout, "others": config.others}

@@ -1,0 +1,142 @@
+"""A controller that is known by calling it: its plans along a walk, and the slope by them."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from model import ANCHOR, BRIEF, PLAIN, ROBOT
+
+from hector_jax.control.controller import contacts_needed, plan
+from hector_jax.control.parameters import gradient_by_steps, step_names
+from hector_jax.control.reference import anchor_at, named_command
+from hector_jax.control.weights import nominal
+from hector_jax.core.inputs import InputError
+from hector_jax.own.planner import call_planner, plan_inputs
+from hector_jax.own.program import program_of
+from hector_jax.own.walk_log import at_ticks, log_of, trajectory_of
+from hector_jax.sim.loop import Job
+from hector_jax.sim.walk import walk
+from hector_jax.sim.world import hfs
+from hector_jax.tuning.called import Planned, call_along
+from hector_jax.tuning.curvature import least_squares_jit
+from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
+from hector_jax.tuning.loss import PAPER_LOSS
+from hector_jax.tuning.rollout import Scenario
+
+ROLLOUT = replace(BRIEF, ticks=25)
+CONFIG, COMMAND, WEIGHTS = BRIEF.walk, named_command("s"), nominal()
+
+
+@pytest.fixture(scope="module")
+def walked():
+    job = Job(WEIGHTS, COMMAND, hfs(), ROLLOUT.ticks * CONFIG.gait.tick)
+    return trajectory_of(at_ticks(log_of(walk(CONFIG, ROBOT, job)), CONFIG.gait.tick))
+
+
+@jax.jit
+def this_controller(asked):
+    """Answer with the plans of this project's controller."""
+
+    def one(row):
+        time, state, feet, weights = row
+        planned = plan(
+            CONFIG,
+            ROBOT,
+            CONFIG.parameters(weights),
+            command=asked.command,
+            anchor=anchor_at(ROBOT, asked.initial, 0),
+            tick=jnp.round(time / CONFIG.gait.tick).astype(int),
+            state=state,
+            feet=feet,
+            max_contacts=contacts_needed(CONFIG, 0),
+        )
+        return Planned(*planned.wrench, planned.touchdown.position)
+
+    rows = asked.time, asked.state, asked.feet, asked.weights
+    return jax.lax.map(one, jax.tree.map(jnp.asarray, rows), batch_size=64)
+
+
+def test_the_slope_by_calls_is_that_of_the_controller(walked):
+    inputs = plan_inputs(CONFIG, ROBOT, WEIGHTS, COMMAND, walked)
+    called = call_along(this_controller, inputs, np.ones(len(inputs.time), bool))
+    scenario = Scenario(ROBOT, COMMAND, ANCHOR, PLAIN)
+    found = []
+    for plans in (None, called):
+        grounding = fit_grounding(ROLLOUT, scenario, WEIGHTS, walked, called=plans)
+        inputs = ROLLOUT, grounding, WEIGHTS, PAPER_LOSS
+        found.append(least_squares_jit(*inputs, walk=grounded_rollout))
+    losses = [float(evaluation.loss) for evaluation, _ in found]
+    assert losses[1] == pytest.approx(losses[0], rel=1e-9)
+    exact, calls = (np.asarray(gradient_by_steps(WEIGHTS, x.gradient)) for x, _ in found)
+    assert np.linalg.norm(calls - exact) < 0.03 * np.linalg.norm(exact)
+    matrices = [np.asarray(matrix) for _, matrix in found]
+    assert np.linalg.norm(matrices[1] - matrices[0]) < 0.05 * np.linalg.norm(matrices[0])
+
+
+def test_between_plans_the_last_one_is_kept(walked):
+    inputs = plan_inputs(CONFIG, ROBOT, WEIGHTS, COMMAND, walked)
+    asked = []
+
+    def linear(asked_for):
+        asked.append(asked_for)
+        force = asked_for.state.position[:, None] * np.ones((1, 2, 1))
+        moment = np.log(asked_for.weights.Q.euler)[:, None] * np.ones((1, 2, 1))
+        return Planned(force, moment, asked_for.feet.position)
+
+    made = np.arange(len(inputs.time)) % 3 == 1
+    called = call_along(linear, inputs, made)
+    numbers = len(step_names(WEIGHTS))
+    assert asked[0].time.shape == ((1 + 12 + 6 + numbers) * made.sum(),)
+    slopes = called.slopes[np.flatnonzero(made)[0]]
+    np.testing.assert_allclose(slopes[:, :3, 3:6], np.stack([np.eye(3)] * 2), atol=1e-9)
+    np.testing.assert_allclose(slopes[:, 3:6, 18:21], np.stack([np.eye(3)] * 2), atol=1e-9)
+    np.testing.assert_allclose(slopes[0, 6:, 12:15], np.eye(3), atol=1e-9)
+    assert not np.any(slopes[:, :3, 6:])
+    last = jax.tree.map(lambda x: x[2], walked.command)
+    tick = jax.tree.map(lambda x: x[2], called)  # of no plan
+    now = {"state": jax.tree.map(lambda x: x[2], inputs.state), "last": last}
+    feet = jax.tree.map(lambda x: x[2], inputs.feet)
+    kept = tick.plan(feet=feet, steps=np.zeros(numbers), disturbance=None, **now)
+    np.testing.assert_array_equal(kept.wrench.force, last.force * inputs.contact[2][:, None])
+    np.testing.assert_array_equal(kept.touchdown.position, feet.position)
+
+
+PROGRAM = """
+import sys
+import numpy as np
+asked = np.load(sys.argv[1])
+rows = asked["contact"].shape
+plans = dict.fromkeys(("force", "moment", "touchdown"), np.zeros((*rows, 3)))
+plans["force"] = asked["weights.R.force"]
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ("", ""),
+        (
+            "del plans['moment']",
+            r"its plans: moment must hold finite numbers of shape \(24, 2, 3\)",
+        ),
+        ("plans['force'] = np.full((*rows, 3), np.nan)", "force must hold finite numbers"),
+        ("plans['force'] = plans['force'][:4]", r"force must .* got shape \(4, 2, 3\)"),
+        ("sys.exit(3)", "ended with code 3"),
+        ("sys.exit(0)", r"ended with code 0, but wrote no plans\.npz"),
+    ],
+)
+def test_a_program_plans_or_is_told_what_is_wrong(walked, tmp_path, change, told):
+    path = tmp_path / "mine.py"
+    path.write_text(f"{PROGRAM}{change}\nnp.savez(sys.argv[2], **plans)\n")
+    inputs = plan_inputs(CONFIG, ROBOT, WEIGHTS, COMMAND, walked)
+    weights = jax.tree.map(lambda x: np.stack([x] * len(inputs.time)), WEIGHTS)
+    asked = inputs._replace(weights=weights)
+    call = partial(call_planner, program_of(path, 20.0), asked)
+    if told:
+        with pytest.raises(InputError, match=f"{path}: {told}"):
+            call()
+    else:
+        np.testing.assert_array_equal(call().force, weights.R.force)
