@@ -28,6 +28,7 @@ from hector_jax.core.trajectory import Trajectory
 from hector_jax.robot.links import rotation_of
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
+from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import on_host, walk
@@ -47,6 +48,18 @@ class Change(NamedTuple):
     # replaces the plant's; of several changes the last counts; never below the soles' own 0.1
     floor_friction: float | None = None
     slope: tuple[float, float] = (0.0, 0.0)  # [rad] by which the floor rises towards x and y
+
+
+class ChangingJob(NamedTuple):
+    """A walk on a plant that changes."""
+
+    job: Job
+    changes: tuple[Change, ...]
+
+    @property
+    def plant(self) -> Robot | None:
+        """See `Job`."""
+        return self.job.plant
 
 
 def _check(change: Change) -> None:
@@ -149,15 +162,15 @@ def walk_with_changes(
     return walk(config, robot, job, build=partial(ChangingPlant, changes=changes))
 
 
-def walk_all(
-    pool: Executor,
-    config: WalkConfig,
-    robot: Robot,
-    walks: Sequence[tuple[Job, Sequence[Change]]],
+def _walk_all(
+    pool: Executor, config: WalkConfig, robot: Robot, walks: Sequence[ChangingJob]
 ) -> Iterator[Trajectory]:
-    """Walk all jobs, each with its changes, in a pool; yields the walks in order."""
     jobs, changes = zip(*walks, strict=True)
     host_robot = jax.tree.map(np.asarray, robot)
     return pool.map(
         walk_with_changes, repeat(config), repeat(host_robot), map(on_host, jobs), changes
     )
+
+
+CHANGING = MUJOCO_C._replace(walk=_walk_all, differs="the plants change on the way")
+"""MuJoCo C that walks a `ChangingJob` in the place of a job."""

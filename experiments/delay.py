@@ -7,26 +7,22 @@ white noise of the stand-in's estimate, with one change of the controller at a t
 is that of the linear loops (`sim.margin`): as proposed, and by the gains of the rule before.
 """
 
-import sys
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
+import lib
 import numpy as np
 import plots
-import tyro
-from lib import check_names, write_report
 
-from hector_jax.cli.flags import named_file
 from hector_jax.control.controller import WalkConfig, walk_config
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import nominal
-from hector_jax.core.console import exit_code, say
-from hector_jax.core.files import make_folder
+from hector_jax.core.console import say
 from hector_jax.core.inputs import InputError, plural
-from hector_jax.core.runtime import setup_jax, workers
+from hector_jax.core.runtime import workers
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, Range, check
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
@@ -82,8 +78,8 @@ CHANGES: dict[str, Callable[[Robot, WalkConfig], WalkConfig]] = {
 """Changes of a controller by their names."""
 
 
-@dataclass(frozen=True)
-class Flags:
+@dataclass(frozen=True, kw_only=True)
+class Flags(lib.Flags):
     """What walks where."""
 
     robots: tuple[str, ...] = ("quadruped=examples/quadruped/robot.toml",)  # NAME=TOML
@@ -93,18 +89,13 @@ class Flags:
     lags: tuple[Annotated[float, POSITIVE], ...] = (4.0, 6.0, 6.0, 6.0)  # [ms], one for each delay
     seeds: Annotated[int, AT_LEAST_ONE] = 1  # of the noise, from 1 on
     out: Path = Path("runs/delay")  # folder of the report
-    processes: Annotated[int, AT_LEAST_ONE] = 2  # one core each
 
     def __post_init__(self) -> None:
-        check(self)
-        check_names("traj", self.traj, COMMANDS)
-        check_names("changes", self.changes, CHANGES)
+        check(self, traj=COMMANDS, changes=tuple(CHANGES))
+        lib.named_files("robots", self.robots)
         if len(self.delays) != len(self.lags):
             count = f"{len(self.delays)} delays and {len(self.lags)} lags"
             raise InputError(f"--lags must be one for each of --delays, got {count}")
-        for text in self.robots:
-            if not named_file(text)[0]:
-                raise InputError(f"--robots must be NAME=TOML, got {text!r}")
 
 
 def plant(robot: Robot, delay: float, lag: float) -> Imperfections:
@@ -151,17 +142,13 @@ def root_locus(robot: Robot, change: str) -> list[list[tuple[float, float]]]:
     return [[(float(m.real), float(m.imag) / (2 * np.pi)) for m in each] for each in found]
 
 
-def main() -> None:
+def main(flags: Flags) -> Path:
     """Write report.md, delay.json and a root locus of each robot."""
-    flags = tyro.cli(Flags)
-    setup_jax()
-    make_folder(flags.out)
     walks, loci, tables, pictures = {}, {}, [], {}
     motors = zip(flags.delays, flags.lags, strict=True)
     head = ["change", *(f"{delay:g}, {lag:g} ms" for delay, lag in motors)]
     with workers(flags.processes) as pool:
-        for text in flags.robots:
-            name, file = named_file(text)
+        for name, file in lib.named_files("robots", flags.robots).items():
             robot = load_robot(Path(file))
             loci[name] = {change: root_locus(robot, change) for change in (BEFORE, AS_PROPOSED)}
             picture = f"root-locus-{name}.png"
@@ -178,11 +165,9 @@ def main() -> None:
     )
     numbers = {"walks": walks, "delays": list(flags.delays), "lags": list(flags.lags)}
     numbers |= {"root_locus": loci, "root_locus_delays": (1e3 * LOCUS).tolist()}
-    what = ", ".join([*walks, *flags.traj])
-    path, title = flags.out / "report.md", f"Delay of the motors: {what}"
-    report = {"numbers": numbers, "json_name": "delay.json", "pictures": pictures}
-    print(write_report(path, title, [about, *tables], **report))
+    title = f"Delay of the motors: {', '.join([*walks, *flags.traj])}"
+    return lib.write_report(flags.out / "delay.json", title, [about, *tables], numbers, pictures)
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code("delay", main))
+    lib.run(main, Flags)

@@ -1,73 +1,101 @@
-"""Shared functions of the experiments: cached groups of walks, and the writing of reports."""
+"""Shared parts of the experiments: how they start, their flags, and the writing of reports."""
 
 import os
 import shlex
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, NoReturn
 
 import jax
 import numpy as np
+import tyro
 from jaxtyping import Shaped
 from scipy import stats
 
+from hector_jax.cli.flags import named_file
 from hector_jax.control.weights import Weights, direction_names, scale_weights
-from hector_jax.core.console import bar
+from hector_jax.core.console import exit_code
 from hector_jax.core.environment import environment
-from hector_jax.core.files import write_file, write_json
-from hector_jax.core.inputs import InputError, plural
-from hector_jax.core.trajectory import Trajectory
-from hector_jax.core.tree import stack
-from hector_jax.robot.model import Robot
-from hector_jax.store.cache import content_key, load_or_make
+from hector_jax.core.files import make_folder, write_file, write_json
+from hector_jax.core.inputs import InputError
+from hector_jax.core.runtime import setup_jax
+from hector_jax.core.settings import AT_LEAST_ONE, check
 from hector_jax.verdict.metrics import COVERAGE, Interval
 
-Tree = TypeVar("Tree")
-Walk = TypeVar("Walk")  # a job, or what else is walked
-
 RESAMPLES, FEWEST = 10_000, 4  # resamples of a bootstrap; fewest samples for an interval
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flags:
+    """Flags of every experiment."""
+
+    out: Path = Path("runs")  # folder of the report
+    processes: Annotated[int, AT_LEAST_ONE] = 2  # that walk in MuJoCo, one core each
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+def run(experiment: Callable[[Any], Path | None], flags: Any, about: str | None = None) -> NoReturn:
+    """Run an experiment as a program, which prints the path of its report.
+
+    Args:
+        experiment: function of the flags.
+        flags: their class, or classes, each of which is a sub-command.
+        about: the text of --help, by default that of the class.
+    """
+
+    def work() -> None:
+        given = tyro.cli(flags, description=about)
+        setup_jax()
+        make_folder(given.out)
+        if report := experiment(given):
+            print(report)
+
+    sys.exit(exit_code(Path(sys.argv[0]).stem, work))
+
+
+def named_files(flag: str, texts: Sequence[str]) -> dict[str, str]:
+    """Return the files of a flag by their names.
+
+    Raises:
+        InputError: one is no NAME=FILE, or two have one name.
+    """
+    files = dict(map(named_file, texts))
+    if "" in files or len(files) < len(texts):
+        text = f"--{flag} must be NAME=FILE, each with a NAME of its own"
+        raise InputError(f"{text}, got {' '.join(texts)}")
+    return files
 
 
 def write_report(
     path: Path,
     title: str,
     paragraphs: Sequence[str],
-    *,
     numbers: Mapping[str, Any],
-    json_name: str,
     pictures: Mapping[str, str] | None = None,
 ) -> Path:
-    """Write a report in Markdown and, beside it, its numbers as JSON.
+    """Write numbers as JSON and, beside them, a report in Markdown.
 
     Args:
-        path: the report.
+        path: file of the numbers, in the folder of the report and its pictures.
         title: its heading; commit and command follow.
         paragraphs: its text, in Markdown.
         numbers: JSON values; `environment` is added.
-        json_name: name of the JSON file, in the report's folder.
-        pictures: captions by the names of files in the report's folder.
+        pictures: captions by the names of files.
 
     Returns:
-        The path of the report.
+        The path of the report, `report.md`.
     """
     about = environment()
     images = [f"![{file}]({file})\n\n{caption}" for file, caption in (pictures or {}).items()]
     text = [f"# {title}", made_at(about), *paragraphs, *images]
-    write_json(path.parent / json_name, {"environment": about, **numbers})
-    write_file(path, ("\n\n".join(text) + "\n").encode())
-    return path
-
-
-def check_names(flag: str, names: Iterable[str], choices: Collection[str]) -> None:
-    """Check that all names of a flag are valid choices.
-
-    Raises:
-        InputError: one line naming the flag, the name and the choices.
-    """
-    for name in names:
-        if name not in choices:
-            raise InputError(f"Flags.{flag} must be of {', '.join(choices)}, got {name!r}")
+    write_json(path, {"environment": about, **numbers})
+    report = path.with_name("report.md")
+    write_file(report, ("\n\n".join(text) + "\n").encode())
+    return report
 
 
 def made_at(environment: Mapping[str, str]) -> str:
@@ -79,54 +107,6 @@ def made_at(environment: Mapping[str, str]) -> str:
     script = "/".join(Path(sys.argv[0]).resolve().parts[-2:])
     command = shlex.join(["python", script, *sys.argv[1:]])
     return f"Made at {environment.get('commit', 'an unknown commit')} by `{command}`."
-
-
-def walk_groups(
-    groups: Mapping[str, Sequence[Walk]],
-    walk: Callable[[Sequence[Walk]], Iterator[Trajectory]],
-    score: Callable[[Trajectory], Tree],
-    *,
-    like: Tree,
-    kind: str,
-    robot: Robot,
-    folder: Path,
-    settings: tuple[Any, ...],
-    title: str = "",
-) -> dict[str, Tree]:
-    """Return the scores of groups of walks, stacked by group; whole groups are cached in files.
-
-    Args:
-        groups: jobs by the name of the group, which is part of the file's name.
-        walk: walks jobs, in their order.
-        score: returns the score of a walk, a NamedTuple of arrays.
-        like: a stacked score.
-        kind: of the files.
-        robot: the body.
-        folder: of the files.
-        settings: on which the walks depend beside the jobs, see `content_key`; noted in the files.
-        title: of the progress bar, after the number of walks.
-    """
-    code = ("sim.walk", "sim.parallel", "verdict.metrics")
-    paths = {
-        name: folder / f"{name}-{content_key(*settings, robot, tuple(jobs), code=code)}.npz"
-        for name, jobs in groups.items()
-    }
-
-    def make(missing: list[str], _: Mapping[str, Tree]) -> Iterator[tuple[str, Tree]]:
-        jobs = [job for name in missing for job in groups[name]]
-        with bar(f"{plural(len(jobs), 'walk')}{title}") as report_progress:
-            report_progress(0, len(jobs), "compiling")
-            walks, done = walk(jobs), 0
-            for name in missing:
-                rows = []
-                for _job in groups[name]:
-                    rows.append(score(next(walks)))
-                    done += 1
-                    report_progress(done, len(jobs), name)
-                yield name, stack(rows)
-
-    about = {"settings": [repr(part) for part in settings]}
-    return load_or_make(paths, make, like=lambda _: like, kind=kind, robot=robot, about=about)
 
 
 def bootstrap(statistic: Callable[..., Any], *samples: Shaped[np.ndarray, "n ..."]) -> Interval:

@@ -11,33 +11,31 @@ the former alone is fitted to them.
 Report, weights and the generations so far are in OUT/TUNE; a later call continues there.
 """
 
-import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import cast
+from typing import Annotated, cast
 
 import jax
+import lib
 import numpy as np
-import tyro
 from jaxtyping import Float
-from lib import write_report
 
 from hector_jax.control.parameters import step_bounds, tunables, weights_after
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import best, load_weights, save_weights, weights_tree
-from hector_jax.core.console import bar, exit_code
+from hector_jax.core.console import bar
 from hector_jax.core.environment import code_hash
 from hector_jax.core.files import make_folder
 from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError, plural, require_package
 from hector_jax.core.journal import add_row, continue_journal
-from hector_jax.core.runtime import setup_jax, workers
-from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, Range, check
+from hector_jax.core.runtime import workers
+from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, Range
 from hector_jax.core.trajectory import SOLVED
 from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import tree_hash
@@ -54,26 +52,21 @@ from hector_jax.verdict import judging, metrics
 from hector_jax.walk_tuning.campaign import Campaign
 
 
-@dataclass(frozen=True)
-class Flags:
+@dataclass(frozen=True, kw_only=True)
+class Flags(lib.Flags):
     """What to search."""
 
     tune: tuple[str, ...] = ("weights",)  # as `hector tune --tune`
     start: Path | None = None  # a weights file; by default the set `best`
-    plants: int = 16  # to search on, and as many others to judge by
-    first_plant: int = 100  # seed of the first one
-    generations: int = 30
-    population: int = 16  # weight sets in a generation
-    spread: float = 0.3  # first standard deviation: e-folds, shares of a box
-    seed: int = 0
+    plants: Annotated[int, AT_LEAST_ONE] = 16  # to search on, and as many others to judge by
+    first_plant: Annotated[int, SEED] = 100  # seed of the first one
+    generations: Annotated[int, AT_LEAST_ONE] = 30
+    population: Annotated[int, Range(4)] = 16  # weight sets in a generation
+    spread: Annotated[float, POSITIVE] = 0.3  # first standard deviation: e-folds, shares of a box
+    seed: Annotated[int, SEED] = 0
     engine: str = "auto"  # c (MuJoCo, on the processes), mjx (all at once), auto: mjx on a GPU
     out: Path = Path("runs/many-plants")  # folder of the reports
     robot: Path | None = None  # TOML file of another robot; HECTOR by default
-    processes: int = 2  # one core each
-
-    def __post_init__(self) -> None:
-        counts = dict.fromkeys(("plants", "generations", "processes"), AT_LEAST_ONE)
-        check(self, **counts, population=Range(4), spread=POSITIVE, seed=SEED, first_plant=SEED)
 
 
 _losses = jax.jit(jax.vmap(loss_of, in_axes=(None, 0)))
@@ -160,10 +153,8 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
     return weights_at(evolution.mean)
 
 
-def main() -> None:
+def main(flags: Flags) -> Path:
     """Search, and write report.md, many-plants.json and the weights."""
-    flags = tyro.cli(Flags)
-    setup_jax()
     robot, engine = jax.tree.map(np.asarray, load_robot(flags.robot)), choose_engine(flags.engine)
     start = best(robot) if flags.start is None else load_weights(flags.start, robot)
     config = tunings.tune_config(robot, others=tunables(flags.tune))
@@ -202,10 +193,9 @@ def main() -> None:
         f"falls of {plural(count * len(commands), 'walk')}."
     )
     table = markdown_table(["plants", "set", *commands, "falls"], rows)
-    path, title = folder / "report.md", "A search over many plants"
-    numbers = {"losses": numbers}
-    print(write_report(path, title, [text, table], numbers=numbers, json_name="many-plants.json"))
+    path, title = folder / "many-plants.json", "A search over many plants"
+    return lib.write_report(path, title, [text, table], {"losses": numbers})
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code("many_plants", main))
+    lib.run(main, Flags)

@@ -24,10 +24,10 @@ from typing import Any
 
 import numpy as np
 import tyro
-from lib import check_names
 from matplotlib.axes import Axes
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from PIL import Image, ImageDraw, ImageFont
+from plots import draw_repeats
 
 from hector_jax import (
     Job,
@@ -43,6 +43,7 @@ from hector_jax import (
 )
 from hector_jax.control.weights_file import best
 from hector_jax.core.console import exit_code, say
+from hector_jax.core.settings import check
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.report.motion import motions
 from hector_jax.report.plots.style import SETS, drawing, label_of, looks_of
@@ -72,13 +73,13 @@ class Flags:
     run: Path = Path("runs/straight")  # folder of a run of `hector tune`, for the page
 
     def __post_init__(self) -> None:
-        check_names("names", self.names, PICTURES)
+        check(self, names=tuple(PICTURES))
 
 
-def walk_of(weights: Weights, trajectory: str = "straight") -> Trajectory:
+def walk_of(weights: Weights) -> Trajectory:
     """Walk HECTOR on the first plant of the stand-in."""
     robot = load_robot()
-    job = Job(weights, named_command(trajectory), standin(0), seed=0)
+    job = Job(weights, named_command("straight"), standin(0), seed=0)
     return walk(walk_config(robot), robot, job)
 
 
@@ -193,11 +194,8 @@ def draw_race(path: Path) -> None:
     with drawing(path, 5.8, 3.1, dpi=190.0, legend_columns=2) as figure:
         axes = figure.subplots()
         for method, (label, line) in METHODS.items():
-            each = {int(walks): np.divide(x, 1e6) for walks, x in race[method]["own"].items()}
-            counts, losses = [*each], np.array([*each.values()])
-            axes.plot(counts, np.median(losses, axis=1), marker="o", label=label, **line)
-            band = losses.min(axis=1), losses.max(axis=1)
-            axes.fill_between(counts, *band, color=line["color"], alpha=0.15, linewidth=0)
+            each = {int(walks): losses for walks, losses in race[method]["own"].items()}
+            draw_repeats(axes, each, {"marker": "o", "label": label, **line}, alpha=0.15)
         axes.set(
             xlabel="walks on the simulator (median and range of the repeats)",
             ylabel="loss of the best so far [10$^6$]",

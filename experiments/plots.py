@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
 
 from hector_jax.report.plots import style
 from hector_jax.report.plots.style import SETS, drawing, label_of, log_axis, looks_of
@@ -50,12 +51,12 @@ def front(
     )
 
 
-def starts(path: Path, curves: Float[np.ndarray, "starts iterations"]) -> str:
+def starts(path: Path, curves: Sequence[Float[np.ndarray, " iterations"]]) -> str:
     """Draw the loss by iteration from several starts, and the final losses.
 
     Args:
         path: file to write.
-        curves: accepted losses, NaN elsewhere; the first row starts at nominal.
+        curves: accepted losses, NaN elsewhere; the first one starts at nominal.
     """
     with drawing(path, 7.5, 3.4) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True)
@@ -76,6 +77,23 @@ def starts(path: Path, curves: Float[np.ndarray, "starts iterations"]) -> str:
     return "Loss on the model by iteration from each start, and the losses at the end in order."
 
 
+def draw_repeats(
+    axes: Axes, by_count: Mapping[int, Sequence[float]], line: dict[str, Any], alpha: float
+) -> None:
+    """Draw the median of repeated losses by a count, and their range as a band.
+
+    Args:
+        axes: to draw in.
+        by_count: losses of the repeats.
+        line: arguments of plot; its colour is that of the band.
+        alpha: of the band.
+    """
+    counts, losses = [*by_count], np.array([*by_count.values()]) / 1e6
+    axes.plot(counts, np.median(losses, axis=1), **line)
+    band = losses.min(axis=1), losses.max(axis=1)
+    axes.fill_between(counts, *band, color=line["color"], alpha=alpha, linewidth=0)
+
+
 def race(path: Path, curves: Mapping[str, Mapping[int, Sequence[float]]]) -> str:
     """Draw the loss of the best set so far of each entry: median and range of the repeats.
 
@@ -86,11 +104,8 @@ def race(path: Path, curves: Mapping[str, Mapping[int, Sequence[float]]]) -> str
     with drawing(path, 7.0, 4.8, legend_columns=2 if max(map(len, curves)) > 20 else 4) as figure:
         axes = figure.subplots()
         for i, (name, by_budget) in enumerate(curves.items()):
-            walks, losses = np.array(list(by_budget)), np.array(list(by_budget.values())) / 1e6
-            color, dashes = f"C{i % 10}", ("-", "--", ":")[i // 10 % 3]
-            axes.plot(walks, np.median(losses, axis=1), dashes, color=color, label=name)
-            bounds = losses.min(axis=1), losses.max(axis=1)
-            axes.fill_between(walks, *bounds, color=color, alpha=0.1, linewidth=0)
+            look = {"color": f"C{i % 10}", "linestyle": ("-", "--", ":")[i // 10 % 3]}
+            draw_repeats(axes, by_budget, {**look, "label": name}, alpha=0.1)
         axes.set(xlabel="walks", ylabel="L of the best set so far [10$^6$]", xscale="log")
         counts = max(curves.values(), key=len)
         axes.set_xticks([*counts], [*map(str, counts)])
@@ -128,15 +143,6 @@ def survival(path: Path, rows: Mapping[str, Mapping[str, Any]]) -> str:
         "on the same plant (left of 1 is better), and the walks without a fall (right is better). "
         "Lines are 95 % intervals from redrawing the plants."
     )
-
-
-_PHI = {  # colour, marker, and hatch of bars
-    "command": ("black", ".", None),
-    "linear": (style.PURPLE, "^", "//////"),
-    "paper": (style.ORANGE, "x", None),
-    "net": (style.GREEN, "o", None),
-    "net without legs": (style.BLUE, "s", "......"),
-}
 
 
 def root_locus(

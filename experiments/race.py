@@ -11,7 +11,6 @@ because a low loss on one plant is partly fitted to it.
 The walks of the tuner and the rivals that have ended are kept in OUT.
 """
 
-import sys
 from collections.abc import Iterator
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
@@ -21,21 +20,20 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import jax
+import lib
 import numpy as np
 import plots
-import tyro
 from jaxtyping import Float
-from lib import check_names, write_report
 from rivals import RIVALS, Task, search
 
 from hector_jax.control.parameters import step_bounds, weights_after
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.arrays import Array
-from hector_jax.core.console import bar, exit_code
+from hector_jax.core.console import bar
 from hector_jax.core.files import make_folder
 from hector_jax.core.identity import function_id
-from hector_jax.core.runtime import setup_jax, workers
+from hector_jax.core.runtime import workers
 from hector_jax.core.settings import AT_LEAST_ONE, SEED, Range, check
 from hector_jax.grfm.network import effect_of
 from hector_jax.report.report import markdown_table
@@ -57,8 +55,8 @@ TUNER = "tuner"
 SPREAD, NEAR = 1.0, 3.0  # of rivals, in log-weights: first standard deviation, and their box
 
 
-@dataclass(frozen=True)
-class Flags:
+@dataclass(frozen=True, kw_only=True)
+class Flags(lib.Flags):
     """What to race."""
 
     traj: str = "s"
@@ -70,12 +68,9 @@ class Flags:
     engine: str = "c"  # what walks, one of `hector walk --engine` but mjx
     robot: Path | None = None  # TOML file of another robot; HECTOR by default
     out: Path = Path("runs/race")  # folder of the report
-    processes: Annotated[int, AT_LEAST_ONE] = 2  # one core each
 
     def __post_init__(self) -> None:
-        check(self)
-        check_names("rivals", self.rivals, RIVALS)
-        check_names("engine", [self.engine], ("c", "drake", "pinocchio"))
+        check(self, rivals=tuple(RIVALS), engine=("c", "drake", "pinocchio"))
 
 
 Contest = tuple[str, int]
@@ -172,10 +167,8 @@ def entry(losses: Float[np.ndarray, "seeds walks"]) -> dict[str, Any]:
     return {"own": {n: best[:, n - 1].tolist() for n in budgets}, "falls": falls.tolist()}
 
 
-def main() -> None:
+def main(flags: Flags) -> Path:
     """Race, judge the set of the tuner, and write report.md, race.json and the picture."""
-    flags = tyro.cli(Flags)
-    setup_jax()
     robot, engine = jax.tree.map(np.asarray, load_robot(flags.robot)), choose_engine(flags.engine)
     config, command = best_set.on_walks(tunings.tune_config(robot)), named_command(flags.traj)
     folder = flags.out / TUNER
@@ -207,12 +200,11 @@ def main() -> None:
         flags.traj: entries,
         "others": others,
     }
-    path, picture = flags.out / "report.md", f"{flags.traj}.png"
+    picture, text = f"{flags.traj}.png", [intro, table, on_others]
     pictures = {picture: plots.race(flags.out / picture, own)}
-    text = [intro, table, on_others]
-    options = {"numbers": numbers, "json_name": "race.json", "pictures": pictures}
-    print(write_report(path, f"The race: {flags.out.name}", text, **options))
+    title = f"The race: {flags.out.name}"
+    return lib.write_report(flags.out / "race.json", title, text, numbers, pictures)
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code("race", main))
+    lib.run(main, Flags)

@@ -7,25 +7,19 @@ tuned with each ridge. The sets walk on plants drawn around the hfs, as a run's 
 with other seeds. The last column is the mean log-ratio to nominal over all of these walks.
 """
 
-import sys
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import lib
 import numpy as np
-import tyro
-from lib import write_report
 
 from hector_jax.cli.arguments import data_folder
-from hector_jax.cli.flags import named_file
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import nominal
-from hector_jax.core.console import exit_code
-from hector_jax.core.files import make_folder
-from hector_jax.core.inputs import InputError
-from hector_jax.core.runtime import setup_jax, workers
-from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, check
+from hector_jax.core.runtime import workers
+from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import load_robot
 from hector_jax.store import nets, tunings
@@ -38,8 +32,8 @@ PROBLEMS = {**{name: (name,) for name in COMMANDS}, "all": COMMANDS}
 Losses = dict[str, dict[str, list[float]]]  # L on each plant, by trajectory and set
 
 
-@dataclass(frozen=True)
-class Flags:
+@dataclass(frozen=True, kw_only=True)
+class Flags(lib.Flags):
     """What to tune and where to walk."""
 
     robots: tuple[str, ...] = ("hector=-",)  # NAME=TOML; - is HECTOR
@@ -47,13 +41,10 @@ class Flags:
     plants: Annotated[int, AT_LEAST_ONE] = 16  # seeds from 7100 on
     data: Path = Path("data")  # folder of the walks and nets, which are made if missing
     out: Path = Path("runs/ridge")  # folder of the report
-    processes: Annotated[int, AT_LEAST_ONE] = 2  # one core each
 
     def __post_init__(self) -> None:
-        check(self)
-        for text in self.robots:
-            if not named_file(text)[0]:
-                raise InputError(f"--robots must be NAME=TOML, got {text!r}")
+        super().__post_init__()
+        lib.named_files("robots", self.robots)
 
 
 def walk_robot(flags: Flags, pool: Executor, name: str, file: Path | None) -> Losses:
@@ -104,15 +95,11 @@ def _row(ridge: float, losses: dict[str, Losses]) -> list[str]:
     return [*cells, f"{np.mean(logs):.3f}"]
 
 
-def main() -> None:
+def main(flags: Flags) -> Path:
     """Write report.md and ridge.json."""
-    flags = tyro.cli(Flags)
-    setup_jax()
-    make_folder(flags.out)
     losses = {}
     with workers(flags.processes) as pool:
-        for text in flags.robots:
-            name, file = named_file(text)
+        for name, file in lib.named_files("robots", flags.robots).items():
             losses[name] = walk_robot(flags, pool, name, None if file == "-" else Path(file))
     head = ["ridge", *(f"{name}: L [%]" for name in losses), "mean log-ratio"]
     table = markdown_table(head, [_row(ridge, losses) for ridge in flags.ridges])
@@ -121,10 +108,10 @@ def main() -> None:
         f"with that of all three, on {flags.plants} plants drawn around the hfs (seeds from "
         f"{FIRST_SEED} on, noisy estimate); in brackets the worst walk."
     )
-    title, out = "The ridge of a tuning", flags.out / "report.md"
     numbers = {"losses": losses, "ridges": list(flags.ridges)}
-    print(write_report(out, title, [about, table], numbers=numbers, json_name="ridge.json"))
+    title = "The ridge of a tuning"
+    return lib.write_report(flags.out / "ridge.json", title, [about, table], numbers)
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code("ridge", main))
+    lib.run(main, Flags)

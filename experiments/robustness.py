@@ -11,19 +11,17 @@ chosen. The scores of finished walks are stored under OUT/scores, and a later ca
 """
 
 import re
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
-import jax
+import lib
 import numpy as np
 import plots
 import tyro
-from changes import walk_all, walk_with_changes
-from lib import walk_groups, write_report
+from changes import CHANGING
 from scenes import (
     LAG,
     PAYLOAD,
@@ -37,34 +35,29 @@ from scenes import (
     table,
 )
 
-from hector_jax.cli.flags import named_file
-from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import COMMANDS, UNSEEN
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import load_weights
-from hector_jax.core.console import exit_code
-from hector_jax.core.files import make_folder
-from hector_jax.core.identity import function_id
-from hector_jax.core.inputs import InputError, unknown
-from hector_jax.core.runtime import setup_jax, workers
-from hector_jax.core.settings import AT_LEAST_ONE, check
+from hector_jax.core.inputs import InputError, plural
+from hector_jax.core.runtime import workers
+from hector_jax.core.settings import check
 from hector_jax.core.trajectory import SOLVED
-from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.report.report import WORLDS
-from hector_jax.robot.description import HECTOR, Description
+from hector_jax.robot.description import Description
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.sim.standin import FAMILIES
-from hector_jax.sim.world import Imperfections, named_world
-from hector_jax.tuning.loss import loss_of_robot
-from hector_jax.verdict import metrics
+from hector_jax.sim.world import named_world
+from hector_jax.store import tunings
+from hector_jax.store.setup import Setup
+from hector_jax.verdict import judging, metrics
 from hector_jax.verdict.metrics import Score
 
 BASELINE = "nominal"
 
 
-@dataclass(frozen=True)
-class Flags:
+@dataclass(frozen=True, kw_only=True)
+class Flags(lib.Flags):
     """What to compare."""
 
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()  # NAME=FILE, beside the two
@@ -74,13 +67,9 @@ class Flags:
     scenes: Annotated[SceneConfig, tyro.conf.arg(name="")] = SceneConfig()
     robot: Path | None = None  # TOML file of another biped; HECTOR by default
     out: Path = Path("runs/robustness")  # folder of the report
-    processes: Annotated[int, AT_LEAST_ONE] = 2  # one core each
 
     def __post_init__(self) -> None:
-        check(self)
-        for name in self.traj:
-            if name not in (*COMMANDS, *UNSEEN):
-                raise InputError(unknown("trajectory", name, (*COMMANDS, *UNSEEN)))
+        check(self, traj=(*COMMANDS, *UNSEEN))
         for text in self.plants:
             if not re.fullmatch(r"[a-z-]+=\d+-\d+", text):
                 raise InputError(f"--plants must be WORLD=FIRST-LAST, got {text!r}")
@@ -103,33 +92,26 @@ class Case(NamedTuple):
     world: str
 
 
+Scores = dict[tuple[Case, Level, str], Score]  # by set, the baseline first: (plants, scenes)
 Cells = dict[Case, dict[Level, dict[str, Cell]]]  # by set, the baseline first
 
 
-def weight_sets(named: Sequence[str], robot: Robot | None = None) -> dict[str, Weights]:
-    """Return nominal, expert and the weights of the files of NAME=FILE.
+def weight_sets(flags: Flags, robot: Robot) -> dict[str, Weights]:
+    """Return nominal, expert and the weights of the files of --set.
 
     Raises:
         InputError: no NAME=FILE, a name in use, or a file without weights.
     """
     sets = {BASELINE: nominal(robot), "expert": expert(robot)}
-    for text in named:
-        name, file = named_file(text)
-        # names are part of file names, where other characters might make two of them equal
-        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or name in sets:
-            raise InputError(
-                f"--set must be NAME=FILE, a new NAME of letters, digits and _, got {text!r}"
-            )
+    for name, file in lib.named_files("set", flags.set).items():
+        if name in sets:
+            raise InputError(f"--set {name}={file}: there is a set {name!r} already")
         sets[name] = load_weights(Path(file), robot)
     return sets
 
 
-def compare(scores: Mapping[tuple[Case, Level, str], Score]) -> Cells:
-    """Compare all sets with the baseline in all cases and at all levels.
-
-    Args:
-        scores: (plants, scenes) each, the baseline's first.
-    """
+def compare(scores: Scores) -> Cells:
+    """Compare all sets with the baseline in all cases and at all levels."""
     cells: Cells = {}
     for (case, level, name), score in scores.items():
         cell = evaluate_level(score, scores[case, level, BASELINE])
@@ -137,69 +119,52 @@ def compare(scores: Mapping[tuple[Case, Level, str], Score]) -> Cells:
     return cells
 
 
-def main() -> None:
-    """Write report.md, robustness.json and the pictures."""
-    flags = tyro.cli(Flags)
-    setup_jax()
-    robot = jax.tree.map(np.asarray, load_robot(flags.robot))
-    sets, body, config = weight_sets(flags.set, robot), robot.description, walk_config(robot)
-
-    def plant(world: str, seed: int) -> Imperfections:
-        draw = FAMILIES.get(metrics.family_of(world) or "", partial(named_world, world))
-        return draw(seed, body)
-
-    walks = {
-        (Case(traj, world), level, name, seed): [
-            (scene.job(sets[name], plant(world, seed), seed), scene.changes) for scene in at_level
-        ]
-        for world, seeds in flags.seeds.items()
+def walk_world(flags: Flags, setup: Setup, sets: Mapping[str, Weights], world: str) -> Scores:
+    """Walk all sets in all scenes on the plants of a world."""
+    body, seeds = setup.robot.description, flags.seeds[world]
+    draw = FAMILIES.get(metrics.family_of(world) or "", partial(named_world, world))
+    plants, gait = [draw(seed, body) for seed in seeds], setup.config.rollout.walk.gait
+    levels = {
+        (Case(traj, world), level): {f"{traj} {level.name} {i}": x for i, x in enumerate(scenes)}
         for traj in flags.traj
-        for level, at_level in make_scenes(flags.scenes, traj, config.gait, body.plants).items()
-        for name in sets
-        for seed in seeds
+        for level, scenes in make_scenes(flags.scenes, traj, gait, body.plants).items()
+    }
+    jobs: dict[judging.Case, Any] = {
+        (label, name, seed): scene.job(weights, plant, seed)
+        for scenes in levels.values()
+        for label, scene in scenes.items()
+        for seed, plant in zip(seeds, plants, strict=True)
+        for name, weights in sets.items()
+    }
+    title, folder = f"{plural(len(jobs), 'walk')} on {world}", flags.out / "scores"
+    judged = judging.judge_jobs(setup, jobs, title=title, folder=folder, engine=CHANGING)
+    return {
+        (*at, name): score
+        for at, scenes in levels.items()
+        for name, score in judged.verdict.of_scene(*scenes).scores.items()
     }
 
-    def group(case: Case, level: Level, name: str, seed: int) -> str:
-        return "-".join([*case, level.name, name, str(seed)]).replace(" ", "-").replace("/", "-")
 
-    loss = loss_of_robot(body)
+def main(flags: Flags) -> Path:
+    """Write report.md, robustness.json and the pictures."""
+    robot = load_robot(flags.robot)
+    sets, scores = weight_sets(flags, robot), {}
     with workers(flags.processes) as pool:
-        by_group = walk_groups(
-            {group(*key): jobs for key, jobs in walks.items()},
-            partial(walk_all, pool, config, robot),
-            partial(metrics.score, loss),
-            like=metrics.score_like(0),
-            kind="robustness",
-            robot=robot,
-            folder=flags.out / "scores",
-            settings=(config, repr(loss), function_id(walk_with_changes)),
-        )
-    scores = {
-        (case, level, name): stack(
-            [by_group[group(case, level, name, seed)] for seed in flags.seeds[case.world]]
-        )
-        for case, level, name, _ in walks
-    }
-    print(report(flags, sets, scores, flags.out, body))
+        setup = Setup(pool, tunings.tune_config(robot), robot)
+        for world in flags.seeds:
+            scores |= walk_world(flags, setup, sets, world)
+    return report(flags, sets, scores, robot.description)
 
 
-def report(
-    flags: Flags,
-    sets: Mapping[str, Weights],
-    scores: Mapping[tuple[Case, Level, str], Score],
-    folder: Path,
-    body: Description = HECTOR,
-) -> Path:
+def report(flags: Flags, sets: Mapping[str, Weights], scores: Scores, body: Description) -> Path:
     """Write the report with its pictures and its numbers as JSON; returns its path.
 
     Args:
-        flags, body: of the walks.
+        flags, scores, body: of the walks.
         sets: weights by name, the baseline first.
-        scores: (plants, scenes) each, the baseline's first.
     """
-    make_folder(folder)
     count, payload = flags.scenes.phases, PAYLOAD * body.plants.payload
-    cells, sets = compare(scores), {n: sets[n] for n in dict.fromkeys(key[2] for key in scores)}
+    cells = compare(scores)
     residual = max(float(score.residual.max()) for score in scores.values())
     each = [(case, level, row) for case, rows in cells.items() for level, row in rows.items()]
     totals = {
@@ -240,7 +205,7 @@ def report(
         head = f"## {case.traj}, {world}, plants {seeds[0]} to {seeds[-1]}"
         paragraphs += [head, table(rows, losses)]
         file = f"{case.traj}-{case.world}.png"
-        pictures[file] = plots.survival(folder / file, {x.name: row for x, row in rows.items()})
+        pictures[file] = plots.survival(flags.out / file, {x.name: row for x, row in rows.items()})
     numbers = {
         "flags": {n: value for n, value in asdict(flags).items() if n in ("plants", "scenes")},
         "weights": {name: tree_hash(w) for name, w in sets.items()},
@@ -252,15 +217,14 @@ def report(
             for case, level, row in each
         ],
     }
-    return write_report(
-        folder / "report.md",
+    return lib.write_report(
+        flags.out / "robustness.json",
         "How much the weight sets survive",
         paragraphs,
-        numbers=numbers,
-        json_name="robustness.json",
-        pictures=pictures,
+        numbers,
+        pictures,
     )
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code("robustness", main))
+    lib.run(main, Flags)

@@ -14,7 +14,7 @@ from itertools import permutations
 from typing import Any, NamedTuple
 
 import numpy as np
-from changes import TRUNK_TOP, Change
+from changes import TRUNK_TOP, Change, ChangingJob
 from lib import bootstrap
 from scipy.stats import binom
 
@@ -49,12 +49,13 @@ class Scene(NamedTuple):
     changes: tuple[Change, ...] = ()
     delay: float | None = None  # [s] of the motors, in place of the plant's
 
-    def job(self, weights: Weights, plant: Imperfections, seed: int) -> Job:
-        """Return the walk of a weight set on a plant, without the changes."""
+    def job(self, weights: Weights, plant: Imperfections, seed: int) -> ChangingJob:
+        """Return the walk of a weight set on a plant."""
         if self.delay is not None:
             slow = {"delay": np.asarray(self.delay), "lag": np.asarray(LAG)}
             plant = plant._replace(**slow, estimator=noisy())
-        return Job(weights, self.command, plant, self.seconds, seed, push=self.push)
+        job = Job(weights, self.command, plant, self.seconds, seed, push=self.push)
+        return ChangingJob(job, self.changes)
 
 
 class Level(NamedTuple):

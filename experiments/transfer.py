@@ -10,7 +10,6 @@ Walks on the hfs are stored under OUT/hfs and used by a later call: walked by Mu
 processes, or all at once in MJX where JAX sees an accelerator.
 """
 
-import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass
@@ -21,7 +20,6 @@ from typing import Any, NamedTuple
 import jax
 import lib
 import numpy as np
-import tyro
 from jaxtyping import Float
 
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
@@ -33,10 +31,11 @@ from hector_jax.control.weights import (
     scale_weights,
     weights_to_vector,
 )
-from hector_jax.core.console import bar, exit_code
-from hector_jax.core.files import make_folder
-from hector_jax.core.runtime import setup_jax, workers
-from hector_jax.core.trajectory import Load, Trajectory
+from hector_jax.core.console import bar
+from hector_jax.core.inputs import plural
+from hector_jax.core.runtime import workers
+from hector_jax.core.settings import check
+from hector_jax.core.trajectory import Load
 from hector_jax.grfm.effect import Effect, Window, last_command
 from hector_jax.grfm.network import as_effect
 from hector_jax.report.report import markdown_table
@@ -45,31 +44,27 @@ from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
 from hector_jax.store import nets
+from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig, step_status, tune_step
-from hector_jax.tuning.loss import PAPER_LOSS, loss_of
 from hector_jax.tuning.rollout import Scenario
 from hector_jax.tuning.status import StepStatus
+from hector_jax.verdict import judging
 from hector_jax.verdict.metrics import Interval
 
 STEP = float(np.log(1.05))  # of the central differences, in log-weights
 
 
-@dataclass(frozen=True)
-class Flags:
+@dataclass(frozen=True, kw_only=True)
+class Flags(lib.Flags):
     """What to compare, at nominal weights."""
 
     data: Path = Path("data")  # walks and nets; made where missing
     out: Path = Path("runs/transfer")  # folder of the report
     trajectories: tuple[str, ...] = COMMANDS
     phases: tuple[int, ...] = (0, 10, 20, 30)  # gait ticks at which the command starts
-    processes: int = 2  # one core each
 
-
-class Walked(NamedTuple):
-    """Stored results of walks on the hfs."""
-
-    loss: np.ndarray
-    fallen: np.ndarray
+    def __post_init__(self) -> None:
+        check(self, trajectories=COMMANDS)
 
 
 class Row(NamedTuple):
@@ -139,38 +134,32 @@ def phis(pool: Executor, robot: Robot, data: Path) -> dict[str, jax.tree_util.Pa
     return {name: host(effect) for name, effect in effects.items()}
 
 
-def jobs(command: Command, phases: Sequence[int]) -> list[Job]:
-    """Return the walks of a gradient on the hfs: by phase, direction and side."""
-    steps = STEP * np.eye(len(direction_names()))
-    return [
-        Job(jax.device_get(scale_weights(nominal(), side * step)), command, hfs(), start_tick=phase)
-        for phase in phases
-        for step in steps
-        for side in (1, -1)
-    ]
-
-
-def _walked(walk: Trajectory) -> Walked:
-    return Walked(np.asarray(loss_of(PAPER_LOSS, walk)), walk.fallen.any())
-
-
 def simulator_gradients(pool: Executor, flags: Flags, robot: Robot) -> dict[str, Gradients]:
     """Return central differences on the hfs by trajectory, NaN where a walk fell."""
-    config, engine = TuneConfig().rollout.walk, choose_engine("auto")
-    walked = lib.walk_groups(
-        {name: jobs(named_command(name), flags.phases) for name in flags.trajectories},
-        partial(engine.walk, pool, config, robot),
-        _walked,
-        like=Walked(np.zeros(0), np.zeros(0)),
-        kind="transfer",
-        robot=robot,
-        folder=flags.out / "hfs",
-        settings=(config, repr(PAPER_LOSS), engine.name),
-        title=f" on the high-fidelity simulator, engine {engine.name}",
+    setup, engine, names = (
+        Setup(pool, TuneConfig(), robot),
+        choose_engine("auto"),
+        direction_names(),
     )
-    shape = len(flags.phases), len(direction_names()), 2
-    losses = {name: np.where(one.fallen, np.nan, one.loss) for name, one in walked.items()}
-    return {name: slopes(loss.reshape(shape)) for name, loss in losses.items()}
+
+    def job(name: str, phase: int, step: np.ndarray) -> Job:
+        weights = jax.device_get(scale_weights(nominal(), step))
+        return Job(weights, named_command(name), hfs(), start_tick=phase)
+
+    jobs = {
+        (name, f"{phase} {direction} {side:+d}", 0): job(name, phase, side * step)
+        for name in flags.trajectories
+        for phase in flags.phases
+        for direction, step in zip(names, STEP * np.eye(len(names)), strict=True)
+        for side in (1, -1)
+    }
+    title = f"{plural(len(jobs), 'walk')} on the high-fidelity simulator, engine {engine.name}"
+    folder = flags.out / "hfs"
+    walked = judging.score_jobs(setup, jobs, title=title, folder=folder, engine=engine)
+    scores = [one.score for one, _ in walked.values()]
+    losses = [np.nan if score.fallen else float(score.L) for score in scores]
+    shape = len(flags.trajectories), len(flags.phases), len(names), 2
+    return dict(zip(flags.trajectories, slopes(np.reshape(losses, shape)), strict=True))
 
 
 def model_gradients(
@@ -232,7 +221,7 @@ def report(flags: Flags, gradients: Mapping[str, Mapping[str, Gradients]]) -> Pa
         return row and row._asdict() | {"cosine": row.cosine._asdict()}
 
     return lib.write_report(
-        flags.out / "report.md",
+        flags.out / "transfer.json",
         "Does the gradient transfer?",
         [
             "Cosine between the model's gradient of L in 18 log-weights at nominal weights and the "
@@ -242,7 +231,7 @@ def report(flags: Flags, gradients: Mapping[str, Mapping[str, Gradients]]) -> Pa
             "and its share of their squared distance.",
             table(rows),
         ],
-        numbers={
+        {
             "weights": direction_names(),
             "phases": flags.phases,
             "rows": {n: {k: as_result(row) for k, row in each.items()} for n, each in rows.items()},
@@ -251,18 +240,13 @@ def report(flags: Flags, gradients: Mapping[str, Mapping[str, Gradients]]) -> Pa
                 for name, each in gradients.items()
             },
         },
-        json_name="transfer.json",
     )
 
 
-def main() -> None:
+def main(flags: Flags) -> Path:
     """Write report.md and transfer.json."""
-    flags = tyro.cli(Flags)
-    lib.check_names("trajectories", flags.trajectories, COMMANDS)
-    setup_jax()
-    make_folder(flags.out)
-    print(report(flags, measure(flags)))
+    return report(flags, measure(flags))
 
 
 if __name__ == "__main__":
-    sys.exit(exit_code("transfer", main))
+    lib.run(main, Flags)

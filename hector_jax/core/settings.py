@@ -71,7 +71,7 @@ def convert(value: Any, kind: Any, rule: Rule | None = None, name: str = "") -> 
     Args:
         value: from a file or a program.
         kind: the type annotation; a range in `Annotated` takes precedence over `rule`.
-        rule: allowed numbers or words; without a rule, numbers have to be finite.
+        rule: allowed numbers or words, of a list too; without a rule, numbers have to be finite.
         name: name of the value, for the message.
 
     Raises:
@@ -81,7 +81,7 @@ def convert(value: Any, kind: Any, rule: Rule | None = None, name: str = "") -> 
         kind, *notes = get_args(kind)
         rule = next((note for note in notes if isinstance(note, Range)), rule)
     if isinstance(rule, tuple):
-        kind, rule = Literal[rule], None
+        kind, rule = tuple[Literal[rule], ...] if get_origin(kind) is tuple else Literal[rule], None
     try:
         converted = msgspec.convert(_builtin(value), kind, dec_hook=_instance)
         allowed = rule or Range()

@@ -83,14 +83,14 @@ class Verdict(NamedTuple):
     scores: dict[str, Score]  # by set, (plants, scenes) each
     loss: Loss
 
-    def of_scene(self, scene: str) -> "Verdict":
-        """Return the walks of one scene."""
-        at = [self.scenes.index(scene)]
+    def of_scene(self, *scenes: str) -> "Verdict":
+        """Return the walks of one scene, or of some."""
+        at = [self.scenes.index(scene) for scene in scenes]
         scores = {
             name: jax.tree.map(lambda x: np.take(x, at, axis=1), score)
             for name, score in self.scores.items()
         }
-        return self._replace(scenes=(scene,), scores=scores)
+        return self._replace(scenes=scenes, scores=scores)
 
     @property
     def each(self) -> dict[str, "Verdict"]:
