@@ -24,6 +24,7 @@ from hector_jax.core.console import say
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, Range, check
+from hector_jax.core.trajectory import Trajectory
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.robot.response import response
@@ -110,19 +111,19 @@ def walk_robot(
 ) -> dict[str, list[list[dict[str, float]]]]:
     """Walk a command with each change; returns L, L_ctrl and falls by change, motors and seed."""
     loss, weights = loss_of_robot(robot.description), nominal(robot)
-    motors, seeds = list(zip(flags.delays, flags.lags, strict=True)), range(1, flags.seeds + 1)
-    plants = [plant(robot, *numbers) for numbers in motors]
+    plants = [plant(robot, *numbers) for numbers in zip(flags.delays, flags.lags, strict=True)]
+    seeds = range(1, flags.seeds + 1)
     jobs = [Job(weights, named_command(command), p, seed=seed) for p in plants for seed in seeds]
+
+    def numbers_of(walk: Trajectory) -> dict[str, float]:
+        score = metrics.score(loss, walk)
+        losses = {name: float(score.losses[name]) for name in ("L", "L_ctrl")}
+        return {**losses, "fell": bool(score.fallen)}
+
     results = {}
     for change in flags.changes:
-        config = CHANGES[change](robot, walk_config(robot))
-        scores = [metrics.score(loss, walk) for walk in walk_many(pool, config, robot, jobs)]
-        numbers = [
-            {"L": float(s.L), "L_ctrl": float(s.losses["L_ctrl"]), "fell": bool(np.any(s.fallen))}
-            for s in scores
-        ]
-        count = len(seeds)
-        results[change] = [numbers[i : i + count] for i in range(0, len(numbers), count)]
+        walks = walk_many(pool, CHANGES[change](robot, walk_config(robot)), robot, jobs)
+        results[change] = [[numbers_of(next(walks)) for _ in seeds] for _ in plants]
         say(f"{command}, {change}: {', '.join(map(_cell, results[change]))}")
     return results
 

@@ -91,22 +91,15 @@ def write_report(
     """
     about = environment()
     images = [f"![{file}]({file})\n\n{caption}" for file, caption in (pictures or {}).items()]
-    text = [f"# {title}", made_at(about), *paragraphs, *images]
+    script = "/".join(Path(sys.argv[0]).resolve().parts[-2:])
+    command = shlex.join(["python", script, *sys.argv[1:]])
+    # outside a checkout there is none
+    made = f"Made at {about.get('commit', 'an unknown commit')} by `{command}`."
+    text = [f"# {title}", made, *paragraphs, *images]
     write_json(path, {"environment": about, **numbers})
     report = path.with_name("report.md")
     write_file(report, ("\n\n".join(text) + "\n").encode())
     return report
-
-
-def made_at(environment: Mapping[str, str]) -> str:
-    """Return the line of a report that names the commit, and the script with its flags.
-
-    Args:
-        environment: see `core.environment`; without a commit outside a checkout.
-    """
-    script = "/".join(Path(sys.argv[0]).resolve().parts[-2:])
-    command = shlex.join(["python", script, *sys.argv[1:]])
-    return f"Made at {environment.get('commit', 'an unknown commit')} by `{command}`."
 
 
 def bootstrap(statistic: Callable[..., Any], *samples: Shaped[np.ndarray, "n ..."]) -> Interval:

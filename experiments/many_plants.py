@@ -167,12 +167,8 @@ def main(flags: Flags) -> Path:
     with workers(flags.processes) as pool:
         answer = search(pool, campaign, engine, flags)
         save_weights(folder / "weights.json", answer)
-        sets = {
-            "nominal": nominal(robot),
-            "expert": expert(robot),
-            "start": start,
-            "search": answer,
-        }
+        sets = {"nominal": nominal(robot), "expert": expert(robot)}
+        sets |= {"start": start, "search": answer}
         inputs, judged = (Setup(pool, config, robot), sets, commands), {}
         for title, part in (("own", slice(count)), ("others", slice(count, None))):
             options = {"title": f"walking on the {title} plants", "folder": folder / "scores"}

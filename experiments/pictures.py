@@ -50,6 +50,7 @@ from hector_jax.report.plots.style import SETS, drawing, label_of, looks_of
 from hector_jax.report.video import VideoConfig, write_film, write_strip
 from hector_jax.robot.model import Robot
 from hector_jax.sim.standin import standin
+from hector_jax.sim.world import Imperfections
 
 ROOT = Path(__file__).parents[1]
 OUT = ROOT / "docs" / "pictures"
@@ -76,10 +77,9 @@ class Flags:
         check(self, names=tuple(PICTURES))
 
 
-def walk_of(weights: Weights) -> Trajectory:
-    """Walk HECTOR on the first plant of the stand-in."""
-    robot = load_robot()
-    job = Job(weights, named_command("straight"), standin(0), seed=0)
+def walk_of(robot: Robot, weights: Weights, plant: Imperfections, seconds: float) -> Trajectory:
+    """Walk a robot straight ahead on a plant."""
+    job = Job(weights, named_command("straight"), plant, seconds)
     return walk(walk_config(robot), robot, job)
 
 
@@ -161,9 +161,10 @@ def draw_method(path: Path) -> None:
 
 def draw_film(path: Path) -> None:
     """Film the plain and the tuned weights on one plant."""
-    pair = {"nominal": walk_of(nominal()), "best": walk_of(best())}
+    robot, pair = load_robot(), {"nominal": nominal(), "best": best()}
+    walks = {name: walk_of(robot, weights, standin(0), 4.0) for name, weights in pair.items()}
     config = VideoConfig(width=720, height=488, rate=12)
-    write_film(path, load_robot(), motions(load_robot(), pair), config)
+    write_film(path, robot, motions(robot, walks), config)
 
 
 def draw_before_after(path: Path) -> None:
@@ -172,7 +173,7 @@ def draw_before_after(path: Path) -> None:
     with drawing(path, 7.2, 2.6, dpi=190.0) as figure:
         left, right = figure.subplots(1, 2)
         for name, look in looks_of(sets).items():
-            one = walk_of(sets[name])
+            one = walk_of(load_robot(), sets[name], standin(0), 4.0)
             times = float(one.period) * np.arange(1, len(one.fallen) + 1)
             off = np.asarray(one.state.position) - one.reference.position
             distance = 100 * np.linalg.norm(off[:, :2], axis=1)
@@ -218,8 +219,7 @@ def draw_robots(path: Path) -> None:
 
 def _still(robot: Robot, weights: Weights, title: str) -> Image.Image:
     """Return a picture of a walk, with the robot's name and mass below."""
-    job = Job(weights, named_command("straight"), hfs(robot.description), seconds=2.0)
-    moved = motions(robot, {title: walk(walk_config(robot), robot, job)})
+    moved = motions(robot, {title: walk_of(robot, weights, hfs(robot.description), 2.0)})
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "still.png"
         write_strip(file, robot, moved, VideoConfig(width=1000, height=560, tiles=4))

@@ -141,15 +141,16 @@ def race(setup: Setup, campaign: Campaign, flags: Flags) -> tuple[Weights, dict[
     return tuning.sets[tuning.best].weights, {TUNER: own, **rivals}
 
 
-def judge(setup: Setup, weights: Weights, flags: Flags) -> tuple[str, dict[str, list[float]]]:
+def judge(
+    setup: Setup, campaign: Campaign, weights: Weights, flags: Flags
+) -> tuple[str, dict[str, list[float]]]:
     """Walk the set of the tuner on other plants; return the change against nominal, and each L."""
     seeds = range(flags.first_plant, flags.first_plant + flags.plants)
     plants = [named_world("hfs-varied", seed, setup.robot.description) for seed in seeds]
-    inputs = setup, {"nominal": nominal(setup.robot), TUNER: weights}
-    options = {"title": "judging the tuner", "folder": flags.out / "scores"}
-    engine, command = choose_engine(flags.engine), named_command(flags.traj)
-    commands = {flags.traj: command}
-    verdict = judging.judge(*inputs, commands, plants, seeds, **options, engine=engine).verdict
+    sets = {"nominal": nominal(setup.robot), TUNER: weights}
+    options = {"folder": flags.out / "scores", "engine": campaign.engine}
+    inputs = setup, sets, campaign.commands, plants, seeds
+    verdict = judging.judge(*inputs, title="judging the tuner", **options).verdict
     falls = {name: int(score.fallen.sum()) for name, score in verdict.scores.items()}
     change = metrics.compare(verdict, TUNER, "nominal").change["L"].text()
     text = (
@@ -174,10 +175,11 @@ def main(flags: Flags) -> Path:
     folder = flags.out / TUNER
     make_folder(folder)
     inputs = folder, config, robot, nominal(robot), {flags.traj: command}, [hfs(robot.description)]
+    campaign = Campaign(*inputs, engine=engine)
     with workers(flags.processes) as pool:
         setup = Setup(pool, config, robot)
-        weights, losses = race(setup, Campaign(*inputs, engine=engine), flags)
-        on_others, others = judge(setup, weights, flags)
+        weights, losses = race(setup, campaign, flags)
+        on_others, others = judge(setup, campaign, weights, flags)
     entries = {name: entry(each) for name, each in losses.items()}
     own = {name: each["own"] for name, each in entries.items()}
     intro = (
@@ -185,15 +187,10 @@ def main(flags: Flags) -> Path:
         "set so far on the simulator's own plant after some walks, mean over the seeds [1e6], and "
         "the mean number of falls."
     )
-    rows = [
-        [
-            name,
-            str(len(each["falls"])),
-            *(f"{np.mean(best) / 1e6:.3f}" for best in each["own"].values()),
-            f"{np.mean(each['falls']):.1f}",
-        ]
-        for name, each in entries.items()
-    ]
+    rows = []
+    for name, each in entries.items():
+        means = [f"{np.mean(best) / 1e6:.3f}" for best in each["own"].values()]
+        rows.append([name, str(len(each["falls"])), *means, f"{np.mean(each['falls']):.1f}"])
     table = markdown_table(["method", "seeds", *map(str, own[TUNER]), "falls"], rows)
     numbers = {
         "flags": {name: str(value) for name, value in asdict(flags).items()},

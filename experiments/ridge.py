@@ -58,20 +58,16 @@ def walk_robot(flags: Flags, pool: Executor, name: str, file: Path | None) -> Lo
     sets = {}
     for ridge in flags.ridges:
         setup = Setup(pool, tunings.tune_config(robot, ridge=ridge), robot)
-        folder = flags.out / "kept" / name
-        tuned = tunings.tune_all(
-            setup, problems, folder, title=f"{name}: tuning with ridge {ridge:g}"
-        )
-        sets |= {(key, ridge): found.weights for key, found in tuned.items()}
+        folder, title = flags.out / "kept" / name, f"{name}: tuning with ridge {ridge:g}"
+        tuned = tunings.tune_all(setup, problems, folder, title=title)
+        sets |= {f"{key}-{ridge:g}": found.weights for key, found in tuned.items()}
     setup = Setup(pool, tunings.tune_config(robot), robot)
     plants = best_set.drawn_plants(robot, flags.plants, FIRST_SEED)
     seeds = range(FIRST_SEED, FIRST_SEED + flags.plants)
     losses = {}
     for command in COMMANDS:
-        compared = {"nominal": nominal(robot)}
-        compared |= {
-            f"{key}-{ridge:g}": w for (key, ridge), w in sets.items() if key in (command, "all")
-        }
+        own = {name: w for name, w in sets.items() if name.split("-")[0] in (command, "all")}
+        compared = {"nominal": nominal(robot), **own}
         inputs = setup, compared, {command: named_command(command)}, plants, seeds
         options = {"title": f"{name}: walking {command}", "folder": flags.out / "scores" / name}
         scores = judging.judge(*inputs, **options).verdict.scores

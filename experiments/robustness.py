@@ -20,20 +20,10 @@ from typing import Annotated, Any, NamedTuple
 import lib
 import numpy as np
 import plots
+import scenes
 import tyro
 from changes import CHANGING
-from scenes import (
-    LAG,
-    PAYLOAD,
-    Cell,
-    Level,
-    SceneConfig,
-    as_result,
-    evaluate_level,
-    make_scenes,
-    significant,
-    table,
-)
+from scenes import Cell, Level, SceneConfig
 
 from hector_jax.control.reference import COMMANDS, UNSEEN
 from hector_jax.control.weights import Weights, expert, nominal
@@ -77,12 +67,8 @@ class Flags(lib.Flags):
     @property
     def seeds(self) -> dict[str, range]:
         """Seeds of the plants of each world."""
-        found = {}
-        for text in self.plants:
-            world, _, seeds = text.partition("=")
-            first, last = map(int, seeds.split("-"))
-            found[world] = range(first, last + 1)
-        return found
+        parts = (re.split(r"=|-(?=\d)", text) for text in self.plants)
+        return {world: range(int(first), int(last) + 1) for world, first, last in parts}
 
 
 class Case(NamedTuple):
@@ -114,7 +100,7 @@ def compare(scores: Scores) -> Cells:
     """Compare all sets with the baseline in all cases and at all levels."""
     cells: Cells = {}
     for (case, level, name), score in scores.items():
-        cell = evaluate_level(score, scores[case, level, BASELINE])
+        cell = scenes.evaluate_level(score, scores[case, level, BASELINE])
         cells.setdefault(case, {}).setdefault(level, {})[name] = cell
     return cells
 
@@ -125,14 +111,14 @@ def walk_world(flags: Flags, setup: Setup, sets: Mapping[str, Weights], world: s
     draw = FAMILIES.get(metrics.family_of(world) or "", partial(named_world, world))
     plants, gait = [draw(seed, body) for seed in seeds], setup.config.rollout.walk.gait
     levels = {
-        (Case(traj, world), level): {f"{traj} {level.name} {i}": x for i, x in enumerate(scenes)}
+        (Case(traj, world), level): {f"{traj} {level.name} {i}": x for i, x in enumerate(found)}
         for traj in flags.traj
-        for level, scenes in make_scenes(flags.scenes, traj, gait, body.plants).items()
+        for level, found in scenes.make_scenes(flags.scenes, traj, gait, body.plants).items()
     }
     jobs: dict[judging.Case, Any] = {
         (label, name, seed): scene.job(weights, plant, seed)
-        for scenes in levels.values()
-        for label, scene in scenes.items()
+        for labelled in levels.values()
+        for label, scene in labelled.items()
         for seed, plant in zip(seeds, plants, strict=True)
         for name, weights in sets.items()
     }
@@ -140,8 +126,8 @@ def walk_world(flags: Flags, setup: Setup, sets: Mapping[str, Weights], world: s
     judged = judging.judge_jobs(setup, jobs, title=title, folder=folder, engine=CHANGING)
     return {
         (*at, name): score
-        for at, scenes in levels.items()
-        for name, score in judged.verdict.of_scene(*scenes).scores.items()
+        for at, labelled in levels.items()
+        for name, score in judged.verdict.of_scene(*labelled).scores.items()
     }
 
 
@@ -163,7 +149,7 @@ def report(flags: Flags, sets: Mapping[str, Weights], scores: Scores, body: Desc
         flags, scores, body: of the walks.
         sets: weights by name, the baseline first.
     """
-    count, payload = flags.scenes.phases, PAYLOAD * body.plants.payload
+    count, payload = flags.scenes.phases, scenes.PAYLOAD * body.plants.payload
     cells = compare(scores)
     residual = max(float(score.residual.max()) for score in scores.values())
     each = [(case, level, row) for case, rows in cells.items() for level, row in rows.items()]
@@ -173,7 +159,7 @@ def report(flags: Flags, sets: Mapping[str, Weights], scores: Scores, body: Desc
             "falls": sum(row[name].falls for *_, row in each),
             "falls_more": [
                 f"{' '.join(each[i][0])} {each[i][1].name}"
-                for i in significant([row[name].p for *_, row in each])
+                for i in scenes.significant([row[name].p for *_, row in each])
             ],
         }
         for name in sets
@@ -182,9 +168,9 @@ def report(flags: Flags, sets: Mapping[str, Weights], scores: Scores, body: Desc
     paragraphs = [
         f"Pushes of 0.1 s on the trunk from eight sides, floors that turn slippery for 2 s, both "
         f"begun at {phases}; slopes of 3 degrees that rise towards the named side; {payload:g} kg "
-        f"on top of the trunk; motors with so much delay and {1e3 * LAG:g} ms of lag, with a noisy "
-        "estimate. The controller is told of none of it. Largest relative KKT residual of a plan "
-        f"{residual:.0e}{'.' if residual <= SOLVED else ': **not solved**.'}",
+        f"on top of the trunk; motors with so much delay and {1e3 * scenes.LAG:g} ms of lag, with "
+        "a noisy estimate. The controller is told of none of it. Largest relative KKT residual of "
+        f"a plan {residual:.0e}{'.' if residual <= SOLVED else ': **not solved**.'}",
         *(
             f"{one['falls']} of {one['walks']} walks fall with `{name}`"
             + f"; rows with more falls than `{BASELINE}`, by the test below: "
@@ -203,7 +189,7 @@ def report(flags: Flags, sets: Mapping[str, Weights], scores: Scores, body: Desc
         seeds, world = flags.seeds[case.world], WORLDS.get(case.world, case.world)
         losses = {level: float(np.median(scores[case, level, BASELINE].L)) for level in rows}
         head = f"## {case.traj}, {world}, plants {seeds[0]} to {seeds[-1]}"
-        paragraphs += [head, table(rows, losses)]
+        paragraphs += [head, scenes.table(rows, losses)]
         file = f"{case.traj}-{case.world}.png"
         pictures[file] = plots.survival(flags.out / file, {x.name: row for x, row in rows.items()})
     numbers = {
@@ -213,7 +199,7 @@ def report(flags: Flags, sets: Mapping[str, Weights], scores: Scores, body: Desc
         "totals": totals,
         "cells": [
             {**case._asdict(), "level": level.name}
-            | {"sets": {name: as_result(cell) for name, cell in row.items()}}
+            | {"sets": {name: scenes.as_result(cell) for name, cell in row.items()}}
             for case, level, row in each
         ],
     }

@@ -39,62 +39,33 @@ class Sensitivities(NamedTuple):
     command: Wrench  # (n, T, feet, 3) each: du_j / dtheta
 
 
-def no_tangents(carry: Carry, weights: Weights) -> Carry:
-    """Return the tangents of a start that does not depend on the weights: dx_0 / dtheta = 0."""
-    count = ravel_pytree(weights)[0].size
-    return jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), varied(carry))
-
-
-def step_sensitivities(
-    config: RolloutConfig,
-    scenario: Scenario,
-    weights: Weights,
-    carry: Carry,
-    tangents: Carry,
-    tick: Int[Array, ""],
-) -> tuple[Carry, Carry, Trajectory, Sensitivities]:
-    """Walk one tick of the closed loop with its n tangents.
-
-    Args:
-        config, scenario, weights, carry, tick: see `step_carry`.
-        tangents: of the `varied` carry; the weights are the first axis.
-
-    Returns:
-        The next carry and its tangents, the tick's sample, and the sample's sensitivities (n, 3).
-
-    Source: Eq. 10.
-    """
-    theta, to_weights = ravel_pytree(weights)
-
-    def step(parts: Carry, theta: Float[jax.Array, " n"]) -> tuple:
-        before = with_constants(parts, carry)
-        after, sample = step_carry(config, scenario, to_weights(theta), before, tick)
-        return (varied(after), sample.state, sample.command), (after, sample)
-
-    def tangent_of(tangent: Carry, direction: Float[Array, " n"]) -> tuple:
-        point = varied(carry), jnp.asarray(theta)
-        return jax.jvp(step, point, (tangent, direction), has_aux=True)
-
-    _, (tangents, state, wrench), (after, sample) = jax.vmap(tangent_of, out_axes=(None, 0, None))(
-        tangents, jnp.eye(theta.size)
-    )
-    return after, tangents, sample, Sensitivities(state, wrench)
-
-
 def propagate(
     config: RolloutConfig, scenario: Scenario, weights: Weights
 ) -> tuple[Trajectory, Sensitivities]:
     """Compute a rollout and its sensitivities by forward recursion. Source: Eq. 10."""
     scenario = with_variation(config, scenario)
+    theta, to_weights = ravel_pytree(weights)
 
     def tick(carried: tuple[Carry, Carry], j: Int[Array, ""]):
-        carry, tangents, sample, columns = step_sensitivities(
-            config, scenario, weights, *carried, j
-        )
-        return (carry, tangents), (sample, columns)
+        """Walk one tick of the closed loop with the n tangents of the `varied` carry."""
+        carry, tangents = carried
+
+        def step(parts: Carry, theta: Float[jax.Array, " n"]) -> tuple:
+            before = with_constants(parts, carry)
+            after, sample = step_carry(config, scenario, to_weights(theta), before, j)
+            return (varied(after), sample.state, sample.command), (after, sample)
+
+        def tangent_of(tangent: Carry, direction: Float[Array, " n"]) -> tuple:
+            point = varied(carry), jnp.asarray(theta)
+            return jax.jvp(step, point, (tangent, direction), has_aux=True)
+
+        along = jax.vmap(tangent_of, out_axes=(None, 0, None))
+        _, (tangents, state, wrench), (after, sample) = along(tangents, jnp.eye(theta.size))
+        return (after, tangents), (sample, Sensitivities(state, wrench))
 
     carry, ticks = init_carry(scenario), walked_ticks(config, scenario.anchor)
-    _, (samples, columns) = jax.lax.scan(tick, (carry, no_tangents(carry, weights)), ticks)
+    zero = lambda x: jnp.zeros((theta.size, *x.shape), x.dtype)  # noqa: E731, dx_0 / dtheta
+    _, (samples, columns) = jax.lax.scan(tick, (carry, jax.tree.map(zero, varied(carry))), ticks)
     columns = jax.tree.map(lambda s: jnp.swapaxes(s[config.lead :], 0, 1), columns)
     return without_lead(config, samples), columns
 
