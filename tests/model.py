@@ -1,6 +1,7 @@
 """The model that tests of tunings share: a rollout of 50 ticks, compiled once for all of them."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ from synthetic import synthetic_walk
 
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import Command, standing_anchor
+from hector_jax.control.weights import expert, vector_to_weights, weights_to_vector
 from hector_jax.grfm.dataset import at_interval, make_dataset
 from hector_jax.grfm.network import as_effect, effect_of
 from hector_jax.grfm.residual import init, with_statistics
@@ -18,7 +20,9 @@ from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import mean_objective
 from hector_jax.tuning.rollout import RolloutConfig
 
-ROBOT = load_robot()
+ROOT = Path(__file__).parents[1]
+EXAMPLES = ROOT / "examples"
+ROBOT, QUADRUPED = load_robot(), load_robot(EXAMPLES / "quadruped" / "robot.toml")
 LEARNS_TOUCHDOWNS = ROBOT._replace(
     description=replace(ROBOT.description, tuning=TuningSettings(touchdown_error=True))
 )
@@ -47,6 +51,17 @@ def small_net(seed=0):
 def small_effect(seed=0):
     """Phi of `small_net`."""
     return as_effect(small_net(seed))
+
+
+def vector(weights):
+    """The 24 numbers of weights."""
+    return np.asarray(weights_to_vector(weights))
+
+
+def random_weights(seed, about=expert, factor=3.0):
+    """Twenty-four different numbers, left and right too, within a factor of a named set."""
+    draws = np.random.default_rng(seed).uniform(-1, 1, 24)
+    return vector_to_weights(weights_to_vector(about()) * factor**draws)
 
 
 def mean_of(objectives, losses=None):

@@ -13,13 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from lib import sample_weights
-from model import mean_of
+from model import ANCHOR, ROBOT, mean_of, vector
 
-from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.reference import named_command
 from hector_jax.control.weights import directions, nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.tree import stack
 from hector_jax.grfm.effect import last_command
-from hector_jax.robot.model import load_robot
 from hector_jax.tuning import batch, difftune
 from hector_jax.tuning.batch import (
     PER_CALL,
@@ -36,16 +35,10 @@ from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.tuning.status import StepStatus, Stop
 from hector_jax.tuning.variation import no_variation
 
-ROBOT = load_robot()
-ANCHOR = standing_anchor(ROBOT)
 STARTS = [sample_weights(nominal(), factor, 1)[0] for factor in (1.05, 1.2, 1.5, 2.0, 3.0)]
 TOY = TuneConfig(iterations=40, ridge=0.001)
 CONFIGS = (TOY, replace(TOY, rule="relative"), replace(TOY, others=("turn_lead",)))
 NOMINAL = np.asarray(weights_to_vector(nominal()))
-
-
-def vector(weights):
-    return np.asarray(weights_to_vector(weights))
 
 
 def toy(config, scenario, weights, loss, *, walk=None):

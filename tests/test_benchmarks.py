@@ -2,14 +2,12 @@
 
 import ast
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
+from model import ROOT
 
 from benchmarks import golden, mutation, table
-
-ROOT = Path(__file__).parents[1]
 
 
 def test_planted_faults_are_the_same_each_time_of_every_part_and_change_the_program():

@@ -7,6 +7,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from model import EXAMPLES
 from pretend import call
 
 from hector_jax.control.controller import WalkConfig, walk_config
@@ -24,7 +25,7 @@ from hector_jax.store import nets
 from hector_jax.store.collection import load_walks
 from hector_jax.store.nets import CollectConfig
 
-STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
+STRIDER = EXAMPLES / "strider" / "robot.toml"
 
 
 @pytest.fixture(scope="module")

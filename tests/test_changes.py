@@ -3,13 +3,13 @@
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 from changes import Change, ChangingPlant, changed_world, walk_with_changes, worlds_by_step
+from model import EXAMPLES, ROBOT
 from pretend import instead, pretend_walk
 from test_walk import walk_and_gain
 
@@ -30,8 +30,7 @@ from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.verdict import judging
 
-CONFIG, ROBOT = WalkConfig(), load_robot()
-EXAMPLES = Path(__file__).parents[1] / "examples"
+CONFIG = WalkConfig()
 ARMS, STRIDER = EXAMPLES / "hector-v2" / "arms.toml", EXAMPLES / "strider" / "robot.toml"
 SLOPE = np.deg2rad(3.0)
 

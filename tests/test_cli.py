@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from model import BEST_OTHERS, small_net
+from model import BEST_OTHERS, EXAMPLES, small_net
 from pretend import call, instead, refused
 from synthetic import synthetic_walk
 from test_walks import HandsOver
@@ -124,7 +124,7 @@ def test_wrong_input_is_one_line_before_anything_is_computed(
 
 
 def test_a_robot_without_a_best_set_says_so(monkeypatch, capsys, tmp_path):
-    robot = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
+    robot = EXAMPLES / "strider" / "robot.toml"
     told = f"no {robot.with_name('robot-best.json')}; tune this robot"
     for words in (
         ("walk", "--weights", "best"),

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from model import ROBOT
 
 from hector_jax.control.controller import (
     WalkConfig,
@@ -29,11 +30,10 @@ from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State
 from hector_jax.qp import Status
-from hector_jax.robot.model import compile_model, describe, load_robot
+from hector_jax.robot.model import compile_model, describe
 from hector_jax.tuning.difftune import TuneConfig
 
 CONFIG = WalkConfig()
-ROBOT = load_robot()
 WEIGHT = float(ROBOT.mass * ROBOT.gravity[2])
 HEIGHT = float(ROBOT.standing_height)
 STRAIGHT = named_command("straight")

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from model import ROBOT
 from synthetic import CYCLE, synthetic_walk, turn_walk, turns
 
 from hector_jax.control.weights import nominal, vector_to_weights, weights_to_vector
@@ -12,11 +13,10 @@ from hector_jax.grfm.dataset import at_interval, make_dataset, with_mirror
 from hector_jax.grfm.effect import HISTORY, turn
 from hector_jax.grfm.jobs import KINDS, draw_jobs
 from hector_jax.robot import srbm
-from hector_jax.robot.model import load_robot
 from hector_jax.sim.world import Push
 from hector_jax.store.collection import Walks, collect, load_walks
 
-ROBOT, TICKS = load_robot(), 40
+TICKS = 40
 
 
 def walks_of(*walks):

@@ -6,20 +6,20 @@ import re
 import jax
 import numpy as np
 import pytest
+from model import ROBOT
 from pretend import call, instead, pretend_walk
 
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import nominal
 from hector_jax.control.weights_file import save_weights
-from hector_jax.robot.model import load_robot
 from hector_jax.sim import diagnosis
 from hector_jax.sim.diagnosis import Record, fall_of, likeliest_cause, not_the_weights
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 
-CONFIG, ROBOT = WalkConfig(), load_robot()
+CONFIG = WalkConfig()
 JOB = Job(nominal(), named_command("straight"), hfs(), 1.0)
 STANDING = float(ROBOT.standing_height)
 

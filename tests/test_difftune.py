@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from model import ANCHOR, ROBOT
+from model import ANCHOR, ROBOT, vector
 
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.footstep import FootstepConfig
@@ -18,7 +18,6 @@ from hector_jax.control.weights import (
     expert,
     nominal,
     vector_to_weights,
-    weights_to_vector,
 )
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Wrench
@@ -35,10 +34,6 @@ from hector_jax.tuning.evaluate import Evaluation, Objective, aligned
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig, Scenario
 from hector_jax.tuning.status import Stop
-
-
-def vector(weights):
-    return np.asarray(weights_to_vector(weights))
 
 
 def random_tree(seed, scale=1.0):

@@ -4,20 +4,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from model import ANCHOR, ROBOT
 
 from hector_jax.control.disturbance import NO_DISTURBANCE, IntegralGains, integrate_error
 from hector_jax.control.parameters import GROUPS, TUNABLES
-from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.reference import named_command
 from hector_jax.control.weights import nominal
 from hector_jax.core.trajectory import State
 from hector_jax.grfm.effect import Window, ground_effect
-from hector_jax.robot.model import load_robot
 from hector_jax.tuning.evaluate import evaluate_jit
 from hector_jax.tuning.loss import PAPER_LOSS
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 
-ROBOT = load_robot()
-ANCHOR = standing_anchor(ROBOT)
 GAINS = {"horizontal_gain": 10.0, "height_gain": 40.0, "tilt_gain": 100.0, "yaw_gain": 50.0}
 INTEGRAL = IntegralGains(*GAINS.values())
 integrate = jax.jit(integrate_error, static_argnums=4)

@@ -3,11 +3,11 @@
 import json
 import re
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
 import pytest
+from model import EXAMPLES
 from pretend import call
 
 from hector_jax.control.reference import standing_anchor
@@ -17,7 +17,7 @@ from hector_jax.report import pictures
 from hector_jax.sim.engine import ENGINES, MJX, MUJOCO_C, Engine, choose_engine
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 
-ARMS = Path(__file__).parents[1] / "examples" / "hector-v2" / "arms.toml"
+ARMS = EXAMPLES / "hector-v2" / "arms.toml"
 
 
 def walk_rigid(pool, config, robot, jobs, *, exact=True, batch=0):

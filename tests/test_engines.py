@@ -2,13 +2,13 @@
 
 import importlib
 from functools import cache
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from model import ROOT
 
 from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import named_command
@@ -27,7 +27,6 @@ from hector_jax.verdict.metrics import score
 HECTOR = load_robot()
 CONFIG = walk_config(HECTOR)
 WORLDS = {"ideal": ideal, "hfs": hfs}
-ROOT = Path(__file__).parents[1]
 FILES = [None, *(ROOT / "examples" / name / "robot.toml" for name in ("humanoid", "quadruped"))]
 
 

@@ -21,7 +21,7 @@ import jsonschema
 import mujoco
 import numpy as np
 import pytest
-from model import OTHERS
+from model import OTHERS, ROBOT, random_weights
 from oracles import exact_solution
 from pretend import instead
 from scipy.spatial.transform import Rotation
@@ -36,7 +36,7 @@ from hector_jax.control.gait import GaitConfig
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
 from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.reference import Command, named_command
-from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
+from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.console import Broken
 from hector_jax.core.inputs import InputError
@@ -60,17 +60,11 @@ from hector_jax.sim.world import ideal
 from hector_jax.store.cache import robot_hash
 
 pytestmark = pytest.mark.usefixtures("on_cpu")
-ROBOT, CONFIG = load_robot(), WalkConfig()
+CONFIG = WalkConfig()
 HERE = Path(__file__).parent
 EXAMPLES = HERE.parent / "examples" / "exported"
 WARNINGS = "-Wall -Wextra -Wconversion -Werror -Wframe-larger-than=16000".split()
 BAD_INPUT, OUT_OF_BOUNDS = 6, 7  # of enum controller_status
-
-
-def random_weights(seed):
-    """Twenty-four different numbers, left and right too."""
-    draws = np.random.default_rng(seed).uniform(-1, 1, 24)
-    return vector_to_weights(weights_to_vector(expert()) * 3.0**draws)
 
 
 # The open C++ controller

@@ -4,14 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from model import ROBOT
 
 from hector_jax.control.footstep import FootstepConfig, touchdown_points
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.trajectory import State
-from hector_jax.robot.model import load_robot
 
 RAIBERT, PAPER = FootstepConfig(), FootstepConfig(rule="paper")
-ROBOT = load_robot()
 STANCE = SWING = 0.2
 WAIT = jnp.array([0.3, 0.1])  # the left foot stands for another 0.1 s and then swings
 touchdown = jax.jit(touchdown_points, static_argnames=("config", "stance", "swing"))

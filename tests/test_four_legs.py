@@ -3,13 +3,13 @@
 import re
 import tomllib
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from model import EXAMPLES, QUADRUPED
 from pretend import call
 
 from hector_jax.control.controller import walk_config
@@ -22,11 +22,10 @@ from hector_jax.importing.survey import survey_file
 from hector_jax.robot.checks import standing_data
 from hector_jax.robot.description import description_of
 from hector_jax.robot.kinematics import leg_gravity
-from hector_jax.robot.model import compile_model, load_robot, robot_of
+from hector_jax.robot.model import compile_model, robot_of
 
-FILE = Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml"
+FILE = EXAMPLES / "quadruped" / "robot.toml"
 MODEL = FILE.with_name("quadruped.xml")
-ROBOT = load_robot(FILE)
 LEGS = FEET[4]
 TABLE = FILE.read_text()
 
@@ -122,10 +121,10 @@ def test_legs_are_found_in_any_order_and_by_any_name(tmp_path):
 
 def test_motors_without_armature_get_one_by_their_torque_and_are_told(tmp_path):
     proposal = propose_robot(changed(tmp_path, (' armature="0.01"', "")))
-    expected = 2e-4 * ROBOT.torque_limit[:3]
+    expected = 2e-4 * QUADRUPED.torque_limit[:3]
     assert proposal.table["joints"]["armature"] == pytest.approx(expected, rel=5e-3)
-    assert remarks(ROBOT) == []
-    (line,) = remarks(robot_of(replace(ROBOT.description, model=tmp_path / "quadruped.xml")))
+    assert remarks(QUADRUPED) == []
+    (line,) = remarks(robot_of(replace(QUADRUPED.description, model=tmp_path / "quadruped.xml")))
     assert line.startswith("joint 'front_left_roll' has no armature")
 
 
@@ -162,24 +161,24 @@ def test_pairs_that_are_not_alike_are_refused(tmp_path):
 
 
 def test_joint_torques_of_four_feet_are_the_statics_of_mujoco():
-    data = standing_data(ROBOT.description, compile_model(ROBOT.description))
-    points = np.array([data.site(foot.point).xpos for foot in ROBOT.description.named_feet])
+    data = standing_data(QUADRUPED.description, compile_model(QUADRUPED.description))
+    points = np.array([data.site(foot.point).xpos for foot in QUADRUPED.description.named_feet])
     arms = points - data.subtree_com[1]
     # the least vertical forces that balance weight and moments
     A = np.stack([np.ones(4), arms[:, 0], arms[:, 1]])
-    weight = float(ROBOT.mass * ROBOT.gravity[2])
+    weight = float(QUADRUPED.mass * QUADRUPED.gravity[2])
     force = np.linalg.lstsq(A, [weight, 0.0, 0.0])[0][:, None] * [0.0, 0.0, 1.0]
     need = data.qfrc_bias.copy()
-    for foot, of_foot in zip(ROBOT.description.named_feet, force, strict=True):
+    for foot, of_foot in zip(QUADRUPED.description.named_feet, force, strict=True):
         J = np.zeros((3, len(need)))
         mujoco.mj_jacSite(data.model, data, J, None, data.site(foot.point).id)
         need -= J.T @ of_foot
     np.testing.assert_allclose(need[:6], 0.0, atol=1e-9)
-    joints = jnp.asarray(ROBOT.standing_joints)
+    joints = jnp.asarray(QUADRUPED.standing_joints)
     state = State(*jnp.zeros((4, 3)))._replace(position=jnp.asarray(data.subtree_com[1]))
     wrench = Wrench(jnp.asarray(force), jnp.zeros((4, 3)))
-    held = jax.jit(leg_gravity)(ROBOT, joints, jnp.asarray(ROBOT.gravity))
-    found = jax.jit(stance_torques)(ROBOT, state, joints, wrench) + held
+    held = jax.jit(leg_gravity)(QUADRUPED, joints, jnp.asarray(QUADRUPED.gravity))
+    found = jax.jit(stance_torques)(QUADRUPED, state, joints, wrench) + held
     np.testing.assert_allclose(found, need[6:], atol=1e-8)
 
 

@@ -3,11 +3,11 @@
 import re
 import tomllib
 from dataclasses import replace
-from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+from model import EXAMPLES
 from pretend import call, refused
 from published import JOINTS, small
 
@@ -26,7 +26,6 @@ from hector_jax.robot.response import response, swing_frequency
 from hector_jax.robot.source import build_spec
 from hector_jax.tuning.loss import loss_of_robot
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
 HUMANOID, QUADRUPED = (EXAMPLES / x / f"{x}.xml" for x in ("humanoid", "quadruped"))
 
 

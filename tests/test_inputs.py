@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
+from model import ROBOT
 from scenes import SceneConfig
 
 from hector_jax.cli.flags import Evaluate, Tune
@@ -31,13 +32,10 @@ from hector_jax.grfm import network
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.qp import QpConfig
 from hector_jax.report.video import VideoConfig
-from hector_jax.robot.model import load_robot
 from hector_jax.store import collection
 from hector_jax.store.nets import CollectConfig
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
-
-ROBOT = load_robot()
 
 QUIET = {"database": None, "deadline": None, "suppress_health_check": list(HealthCheck)}
 hundreds = settings(max_examples=300, derandomize=True, **QUIET)

@@ -5,12 +5,12 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 import pytest
+from model import ROBOT
 from pretend import instead, pretend_history, pretend_walk, tuning_of
 
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.journal import add_row
-from hector_jax.robot.model import load_robot
 from hector_jax.sim.world import hfs, ideal
 from hector_jax.store import tunings
 from hector_jax.store.folder import as_row
@@ -19,7 +19,7 @@ from hector_jax.store.tunings import Problem
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.verdict import judging
 
-ROBOT, CONFIG, S = load_robot(), TuneConfig(), named_command("s")
+CONFIG, S = TuneConfig(), named_command("s")
 SETUP = Setup(ThreadPoolExecutor(1), CONFIG, ROBOT)  # which is never asked
 TUNING = tuning_of(pretend_history(12, refused=(3, 5)), expert())
 SETS = {"nominal": nominal(), "expert": expert()}

@@ -5,13 +5,13 @@ form.
 """
 
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from model import EXAMPLES
 from scipy.spatial.transform import Rotation
 
 from hector_jax.core.geometry import rot_x, rot_y, rot_z
@@ -93,7 +93,7 @@ def written(folder, count):
 
 @pytest.fixture(scope="module", params=[*LEGS, "quadruped", "hector"])
 def made(request, tmp_path_factory):
-    path = Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml"
+    path = EXAMPLES / "quadruped" / "robot.toml"
     if request.param == "hector":
         path = None
     elif request.param in LEGS:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from model import ROBOT
 
 from hector_jax.control.footstep import Feet
 from hector_jax.control.legs import (
@@ -22,10 +23,9 @@ from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.trajectory import State, Wrench
 from hector_jax.robot.description import Description
 from hector_jax.robot.kinematics import foot_poses, leg_gravity
-from hector_jax.robot.model import compile_model, describe, load_robot
+from hector_jax.robot.model import compile_model, describe
 
 CONFIG = LegConfig()
-ROBOT = load_robot()
 SWING = 0.2
 WEIGHT = float(ROBOT.mass * ROBOT.gravity[2])
 STANDS = jnp.asarray(ROBOT.standing_joints)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+from model import EXAMPLES
 from pretend import refused
 
 from hector_jax.cli import commands
@@ -144,8 +145,8 @@ def test_latest_is_the_tuning_that_began_last(monkeypatch, capsys, tmp_path):
     assert resolve_latest(from_line(["view", "latest"])).run == Path("latest")
 
 
-SLALOM = Path(__file__).parents[1] / "examples" / "slalom.toml"
-STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
+SLALOM = EXAMPLES / "slalom.toml"
+STRIDER = EXAMPLES / "strider" / "robot.toml"
 
 
 @pytest.mark.parametrize(

@@ -2,13 +2,12 @@
 
 import re
 from itertools import combinations
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from model import ROBOT
+from model import QUADRUPED, ROBOT
 
 from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import COMMANDS, named_command
@@ -20,13 +19,11 @@ from hector_jax.own.log_check import check_log, read_check
 from hector_jax.own.parity import compare_plans
 from hector_jax.own.walk_file import read_walk
 from hector_jax.robot.kinematics import foot_poses, inverse_legs
-from hector_jax.robot.model import load_robot
 from hector_jax.sim.diagnosis import record_walk
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs, named_world
 
 SECONDS, TICK = 2.0, 0.01
-QUADRUPED = load_robot(Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml")
 
 
 def entries_of(robot, job):

@@ -1,11 +1,11 @@
 """How trunk and legs answer, the gains that follow, and the delay that the loops bear."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+from model import QUADRUPED, ROBOT
 from scipy.linalg import solve_discrete_are
 
 from hector_jax.control.controller import walk_config
@@ -13,7 +13,7 @@ from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.weights import nominal
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.checks import standing_data
-from hector_jax.robot.model import compile_model, load_robot
+from hector_jax.robot.model import compile_model
 from hector_jax.robot.response import (
     DELAY,
     LAG,
@@ -24,12 +24,10 @@ from hector_jax.robot.response import (
 )
 from hector_jax.sim.margin import Loops, delay_lines, modes
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
-HECTOR, QUADRUPED = load_robot(), load_robot(EXAMPLES / "quadruped" / "robot.toml")
 RATES = np.geomspace(1.0, 1e3, 20001)  # [rad/s]
 
 
-@pytest.mark.parametrize("robot", [HECTOR, QUADRUPED], ids=lambda r: r.description.name)
+@pytest.mark.parametrize("robot", [ROBOT, QUADRUPED], ids=lambda r: r.description.name)
 def test_the_mobility_is_that_of_a_robot_whose_stance_feet_do_not_move(robot):
     answer = response(robot)
     model = compile_model(robot.description)

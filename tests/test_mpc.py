@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+from model import ROBOT, random_weights
 from oracles import exact_solution, pack_state
 
 from hector_jax.control.contact import (
@@ -34,9 +35,7 @@ from hector_jax.core.settings import from_table, to_table
 from hector_jax.core.trajectory import Disturbance, State, pack_wrench
 from hector_jax.qp import QP, Status, solve_qp
 from hector_jax.robot import srbm
-from hector_jax.robot.model import load_robot
 
-ROBOT = load_robot()
 CONFIG = MpcConfig()
 N, DT = CONFIG.horizon, 0.03
 WEIGHT = float(ROBOT.mass * ROBOT.gravity[2])
@@ -68,11 +67,6 @@ def write(*args):
 
 
 linearise = jax.jit(jax.vmap(lambda e, r: srbm.linearise(ROBOT, e, r, DT)))
-
-
-def random_weights(seed):
-    draws = np.random.default_rng(seed).uniform(-1, 1, 24)
-    return vector_to_weights(weights_to_vector(expert()) * 3.0**draws)
 
 
 def problem(seed, push=1.0, contact=None, yaw=0.5):

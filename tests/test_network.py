@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from model import LEARNS_TOUCHDOWNS
+from model import LEARNS_TOUCHDOWNS, ROBOT
 from synthetic import synthetic_walk
 
 from hector_jax.control.controller import WalkConfig
@@ -22,11 +22,9 @@ from hector_jax.grfm.network import as_effect, effect_of, load_net, save_net
 from hector_jax.grfm.paper import fit_linear, fit_scaling
 from hector_jax.grfm.residual import BOUND, plain_net
 from hector_jax.grfm.training import predict
-from hector_jax.robot.model import load_robot
 from hector_jax.store.tunings import Problem, rollouts_of
 from hector_jax.tuning.difftune import TuneConfig
 
-ROBOT = load_robot()
 apply = jax.jit(lambda effect, window: effect(window))
 
 

@@ -5,7 +5,7 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
-from model import OTHERS
+from model import OTHERS, ROBOT
 
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
@@ -20,7 +20,7 @@ from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Push, build_world, build_worlds, hfs, hfs_drawn, ideal
 
-CONFIG, ROBOT = WalkConfig(), load_robot()
+CONFIG = WalkConfig()
 UNUSED = ("cam_", "light_", "actuator_acc0")  # by MJX, in a robot without muscles
 
 

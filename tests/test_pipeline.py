@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from model import ROBOT
 from pretend import call
 from synthetic import synthetic_walk
 from test_walks import HandsOver
@@ -21,7 +22,6 @@ from hector_jax.core.inputs import InputError
 from hector_jax.grfm import dataset
 from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.grfm.training import TrainConfig
-from hector_jax.robot.model import load_robot
 from hector_jax.store import nets, tunings
 from hector_jax.store.collection import collect
 from hector_jax.store.nets import CollectConfig
@@ -29,7 +29,6 @@ from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
 
-ROBOT = load_robot()
 ONCE = TrainConfig("linear")  # the command's variant here: its fit takes no time
 
 

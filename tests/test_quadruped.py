@@ -3,13 +3,13 @@
 import json
 from functools import partial
 from itertools import product
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import jsonschema
 import numpy as np
 import pytest
+from model import EXAMPLES
 from pretend import call
 
 from hector_jax.cli.arguments import with_gait
@@ -34,7 +34,7 @@ from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs, ideal
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 
-FILE = Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml"
+FILE = EXAMPLES / "quadruped" / "robot.toml"
 ROBOT = load_robot(FILE)
 CONFIG = walk_config(ROBOT)
 ANCHOR = standing_anchor(ROBOT)

@@ -17,6 +17,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from model import ROBOT
 from pretend import call
 
 from hector_jax.cli import flags, run_folder
@@ -28,10 +29,9 @@ from hector_jax.core.files import WriteError, locked, write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import cache_folder, workers
 from hector_jax.core.tree_file import save_tree
-from hector_jax.robot.model import load_robot
 from hector_jax.store.cache import load_or_make
 
-ROBOT, HERE = load_robot(), Path(__file__).parent
+HERE = Path(__file__).parent
 STATE = {"x": np.arange(3.0)}
 
 

@@ -18,11 +18,6 @@ def model():
     return compile_model(describe())
 
 
-@pytest.fixture(scope="module")
-def robot():
-    return load_robot()
-
-
 def standing(model):
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("standing").id)

@@ -4,16 +4,15 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from model import ROOT
 from pretend import pretend_score
 from scenes import DIRECTIONS, Level, SceneConfig, evaluate_level, make_scenes, significant
 
 from hector_jax.core.tree import stack
 
-ROOT = Path(__file__).parents[1]
 SMALL = SceneConfig(forces=(50.0, 100.0), frictions=(0.4, 0.2), phases=3)
 
 

@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 import sensitivity
 from lib import sample_weights
-from model import ANCHOR, CONFIG, LEARNS_TOUCHDOWNS, PLAIN, ROBOT, SHORT, small_effect
+from model import (
+    ANCHOR,
+    CONFIG,
+    LEARNS_TOUCHDOWNS,
+    PLAIN,
+    ROBOT,
+    SHORT,
+    random_weights,
+    small_effect,
+    vector,
+)
 
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
@@ -112,15 +122,6 @@ def start():
     return jax.tree.map(np.asarray, init(replace(CONFIG, others=OTHERS), nominal()).start)
 
 
-def vector(weights):
-    return np.asarray(weights_to_vector(weights))
-
-
-def random_weights(seed):
-    draws = np.random.default_rng(seed).uniform(-np.log(2), np.log(2), 24)
-    return vector_to_weights(weights_to_vector(nominal()) * np.exp(draws))
-
-
 def differences(config, scenario, weights, *, step, directions):
     """Central differences of the loss along directions (n, 24) in log-weights."""
     theta, found = vector(weights), []
@@ -160,7 +161,7 @@ def check_gradient(config, scenario, weights, bar, directions=None, case=""):
 
 
 def test_gradient_over_50_ticks_is_that_of_differences():
-    weights = random_weights(0)._replace(others=start().others)
+    weights = random_weights(0, nominal, 2.0)._replace(others=start().others)
     scenario = STRAIGHT._replace(command=named_command("s"))
     check_gradient(SHORT, scenario, weights, 1e-6, OBLIQUE)
 
@@ -170,7 +171,11 @@ def cases():
     """Random weights for each trajectory, with phi the identity and the net."""
     net = small_effect()  # part of the answer, and of the same program as the plain rigid body
     return [
-        ((name, said), random_weights(seed), Scenario(ROBOT, named_command(name), ANCHOR, effect))
+        (
+            (name, said),
+            random_weights(seed, nominal, 2.0),
+            Scenario(ROBOT, named_command(name), ANCHOR, effect),
+        )
         for seed, name in enumerate(COMMANDS)
         for said, effect in (("plain", PLAIN), ("net", net))
     ]

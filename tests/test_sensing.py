@@ -5,14 +5,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from model import ROBOT
 
-from hector_jax.robot.model import load_robot
 from hector_jax.sim import sensing
 from hector_jax.sim.loop import contact_effect
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import build_world, hfs, ideal, standing_qpos, truth
-
-ROBOT = load_robot()
 
 
 @jax.jit

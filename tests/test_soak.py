@@ -10,19 +10,14 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from model import SHORT, small_net
+from model import ANCHOR, ROBOT, ROOT, SHORT, small_net
 
-from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.reference import named_command
 from hector_jax.control.weights import nominal
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect
-from hector_jax.robot.model import load_robot
 from hector_jax.tuning.difftune import TuneConfig, tune
 from hector_jax.tuning.rollout import RolloutConfig, Scenario
-
-ROOT = Path(__file__).parents[1]
-ROBOT = load_robot()
-ANCHOR = standing_anchor(ROBOT)
 
 
 @pytest.fixture

@@ -2,11 +2,11 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+from model import EXAMPLES
 from published import JOINTS, MOTOR, small, urdf_of
 
 from hector_jax.core.inputs import InputError
@@ -14,7 +14,7 @@ from hector_jax.robot.description import MODEL_PATH, Description, Foot, read_des
 from hector_jax.robot.model import robot_of
 from hector_jax.robot.source import build_spec
 
-STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
+STRIDER = EXAMPLES / "strider" / "robot.toml"
 
 
 def compiled(description):

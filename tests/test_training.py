@@ -7,6 +7,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from model import ROBOT
 from synthetic import synthetic_walk
 
 from hector_jax.core.tree import stack
@@ -14,9 +15,7 @@ from hector_jax.grfm.dataset import at_interval, make_dataset, split_by_walk
 from hector_jax.grfm.effect import Phi, last_command
 from hector_jax.grfm.network import VARIANTS, as_effect, load_net, save_net
 from hector_jax.grfm.training import TrainConfig, errors, errors_by_phi, train
-from hector_jax.robot.model import load_robot
 
-ROBOT = load_robot()
 paper = partial(TrainConfig, "paper", batch=64)
 
 

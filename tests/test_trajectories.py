@@ -1,10 +1,10 @@
 """Trajectories of one's own: what a file may say, and what is told of one that asks too much."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
+from model import EXAMPLES, ROBOT
 from pretend import call, instead
 
 from hector_jax.cli import arguments
@@ -21,15 +21,13 @@ from hector_jax.control.reference import (
 from hector_jax.control.trajectories import beyond, command_of, limits
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.inputs import InputError
-from hector_jax.robot.model import load_robot
 from hector_jax.sim import walk as sim_walk
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig
 
-SLALOM = Path(__file__).parents[1] / "examples" / "slalom.toml"
-ROBOT = load_robot()
+SLALOM = EXAMPLES / "slalom.toml"
 LIMITS = limits(ROBOT, GaitConfig())
 
 

@@ -3,20 +3,19 @@
 import json
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from model import AHEAD, PLAIN, ROBOT
+from model import AHEAD, ANCHOR, EXAMPLES, PLAIN, ROBOT
 from pretend import call
 
 from hector_jax.control.contact import BOX_FRICTION, TWIST, Constraint
 from hector_jax.control.controller import WalkConfig, plan, plan_horizon, walk_config
 from hector_jax.control.footstep import Feet
 from hector_jax.control.mpc import MpcConfig
-from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.reference import named_command
 from hector_jax.control.twin import FROM_ROBOT, FROZEN, PATH, ReferenceInputs, TwinConfig
 from hector_jax.control.weights import expert
 from hector_jax.core.inputs import InputError
@@ -24,8 +23,7 @@ from hector_jax.core.trajectory import State
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout, rollout_config
 
-OWN = Path(__file__).parents[1] / "examples" / "own_controller"
-ANCHOR = standing_anchor(ROBOT)
+OWN = EXAMPLES / "own_controller"
 HEIGHT = float(ROBOT.standing_height)
 STATE = State(*(jnp.array(x) for x in ([0.05, 0.1, 0.3], [1.0, 2.0, 0.5], [0.1] * 3, [0.4, 0, 0])))
 FEET = Feet(STATE.position + jnp.array([[0.1, 0.08, -0.5], [-0.1, -0.08, -0.45]]), jnp.full(2, 0.2))

@@ -16,12 +16,6 @@ from hector_jax.report import video
 from hector_jax.report.motion import motion, motions, poses
 from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film, write_strip
 from hector_jax.robot.description import MODEL_PATH
-from hector_jax.robot.model import load_robot
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return load_robot()
 
 
 def test_a_drawn_pose_has_the_walked_centre_of_mass_and_attitude(robot):

@@ -30,11 +30,6 @@ from hector_jax.store import folder as runs
 from hector_jax.store.cache import robot_hash
 
 
-@pytest.fixture(scope="module")
-def robot():
-    return load_robot()
-
-
 def viewed(seed=0, **kwargs):
     """A pretended walk."""
     walk = pretend_walk(seed, **kwargs)

@@ -10,13 +10,12 @@ from itertools import product
 import jax
 import numpy as np
 import pytest
-from model import OTHERS
+from model import OTHERS, ROBOT
 from test_sensing import momentum
 
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import expert
-from hector_jax.robot.model import load_robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.standin import standin
@@ -24,7 +23,7 @@ from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Push, build_world, hfs, ideal
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 
-CONFIG, ROBOT = WalkConfig(), load_robot()
+CONFIG = WalkConfig()
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from model import AHEAD, ROBOT
+from model import AHEAD, ROBOT, ROOT
 from pretend import call
 
 from hector_jax.control.controller import walk_config
@@ -31,7 +31,6 @@ from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
 
-ROOT = Path(__file__).parents[1]
 CONFIG, SECONDS, PERIOD = walk_config(ROBOT), 0.1, 0.005
 HEIGHT = float(ROBOT.standing_height)
 # It follows the command, off to the left by 1 cm for each e-fold of Q_y from 500.

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from model import ROBOT
 from test_sensing import stand
 
-from hector_jax.robot.model import load_robot, quiet_mujoco
+from hector_jax.robot.model import quiet_mujoco
 from hector_jax.sim.actuators import init_actuators, step_actuators
 from hector_jax.sim.world import (
     MAX_DELAY,
@@ -28,7 +29,6 @@ from hector_jax.sim.world import (
     truth,
 )
 
-ROBOT = load_robot()
 KNEE = 3
 
 
