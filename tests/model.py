@@ -23,9 +23,16 @@ from hector_jax.tuning.rollout import RolloutConfig
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
 ROBOT, QUADRUPED = load_robot(), load_robot(EXAMPLES / "quadruped" / "robot.toml")
-LEARNS_TOUCHDOWNS = ROBOT._replace(
-    description=replace(ROBOT.description, tuning=TuningSettings(touchdown_error=True))
-)
+WEIGHT, HEIGHT = float(ROBOT.mass * ROBOT.gravity[2]), float(ROBOT.standing_height)
+
+
+def robot_with(**settings):
+    """HECTOR with settings of its tunings, see `TuningSettings`."""
+    description = replace(ROBOT.description, tuning=TuningSettings(**settings))
+    return ROBOT._replace(description=description)
+
+
+LEARNS_TOUCHDOWNS = robot_with(touchdown_error=True)
 ANCHOR = standing_anchor(ROBOT)
 SHORT = RolloutConfig(ticks=50)
 CONFIG = TuneConfig(rollout=SHORT)

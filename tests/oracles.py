@@ -2,6 +2,7 @@
 
 import daqp
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import scipy.linalg
 from scipy.optimize import linprog
@@ -13,6 +14,13 @@ from hector_jax.qp import QP
 def dense_rows(A: np.ndarray) -> np.ndarray:
     """Block-diagonal rows (N, r, b) as a plain matrix."""
     return A if A.ndim == 2 else scipy.linalg.block_diag(*A)
+
+
+def mass_matrix(model, data):
+    """MuJoCo's, of all degrees of freedom."""
+    M = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, M)
+    return M
 
 
 def pack_state(state: State, gravity):

@@ -1,9 +1,20 @@
 """Robots as others publish them: a small biped as MJCF, and compiled bodies as a URDF."""
 
+import re
+
 import mujoco
 import numpy as np
 
 from hector_jax.robot.description import Description, Foot
+
+
+def replaced(text, *changes):
+    """The text with some of it replaced, each pattern as often as it is there."""
+    for old, new in changes:
+        assert re.search(old, text), old
+        text = re.sub(old, new, text)
+    return text
+
 
 LEG = """
 <body name="{s}_hip" pos="0 {y} -0.1">
@@ -106,7 +117,11 @@ def place(pos, quat):
     return f'<origin xyz="{write(pos)}" rpy="{write(rpy)}"/>'
 
 
-def urdf_of(model, world=False, effort=True, turn=None):
+LINK = '<link name="payload"><inertial><mass value="5"/></inertial></link>'
+HOLD = '<joint name="{}" type="fixed"><parent link="{}"/><child link="{}"/></joint>'
+
+
+def urdf_of(model, world=False, effort=True):
     """The bodies of a compiled model as a URDF."""
     text = ['<robot name="r">']
     if world:
@@ -135,3 +150,16 @@ def urdf_of(model, world=False, effort=True, turn=None):
             f'<dynamics damping="{model.dof_damping[dof]}" friction="0"/></joint>'
         )
     return "\n".join([*text, "<gazebo><plugin/></gazebo></robot>"])
+
+
+def by_numbers(folder, text):
+    """HECTOR's description, feet by places and standing by angles, of another file."""
+    path = folder / "robot.urdf"
+    path.write_text(text)
+    bend = {"hip_pitch": np.pi / 4, "knee": -np.pi / 2, "ankle": np.pi / 4}
+    angles = {f"{s}_{j}": float(a) for s in ("left", "right") for j, a in bend.items()}
+    feet = tuple(
+        Foot((0.0, 0.0, -0.04), ((0.09, 0.0, -0.04), (-0.06, 0.0, -0.04)), f"{side}_foot")
+        for side in ("left", "right")
+    )
+    return Description(model=path, standing=tuple(angles.items()), feet=feet)

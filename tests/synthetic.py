@@ -20,24 +20,6 @@ def turns(yaw) -> np.ndarray:
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
-def turn_walk(walk: Trajectory, yaw: float) -> Trajectory:
-    """The same walk in a world turned by `yaw`."""
-    R = turns(yaw)
-
-    def state(s: State) -> State:
-        rows = State(s.euler, *(v @ R.T for v in s[1:]))
-        return rows._replace(euler=s.euler + np.array([0.0, 0.0, yaw]))
-
-    return walk._replace(
-        initial=state(walk.initial),
-        state=state(walk.state),
-        reference=state(walk.reference),
-        command=jax.tree.map(lambda w: w @ R.T, walk.command),
-        effect=jax.tree.map(lambda w: w @ R.T, walk.effect),
-        feet=walk.feet @ R.T,
-    )
-
-
 def synthetic_walk(seed: int, ticks: int = 400, noise: float = 1.0) -> Trajectory:
     """One walk at 1 kHz that turns slowly; numpy arrays."""
     rng = np.random.default_rng(seed)

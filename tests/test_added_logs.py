@@ -14,8 +14,8 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from pretend import instead
-from test_walks import HandsOver, same, same_sets
+from pretend import HandsOver, instead
+from test_walks import same, same_sets
 
 from hector_jax.cli import propose, walk
 from hector_jax.cli.flags import Add, Propose, Walk
@@ -206,31 +206,6 @@ def test_a_fallen_walk_is_added_as_one(folder, capsys):
     assert seen["logs"]["ahead"]["seconds"] == pytest.approx(0.04)
 
 
-def test_logs_that_are_undone_and_added_again_leave_the_same_bytes(folder, capsys):
-    next_walk(folder, ("ahead",))
-    add(folder, plain("ahead", "0.npz"))
-    next_walk(folder)
-    before = content(folder)
-    add(folder, carded(folder, "ahead", "1.npz", number=1))
-    after = content(folder)
-    next_walk(folder)  # which the undo makes void
-    capsys.readouterr()
-    add(folder, undo=True)
-    undone = result(capsys)
-    assert (undone["walk"], undone["weights"]) == (1, "robot/weights/1.json")
-    log = Path(*undone["logs"])
-    assert log.read_bytes() == Path("1.npz").read_bytes()
-    next_walk(folder)
-    assert result(capsys)["walk"] == 1
-    now = content(folder)
-    assert now.pop(str(log.relative_to(folder)))
-    assert now == before
-    add(folder, "1.npz")
-    again = content(folder)
-    assert again.items() >= after.items()
-    assert again.keys() - after.keys() == {str(log.relative_to(folder))}
-
-
 def test_the_first_logs_can_be_undone_and_others_cannot(folder, capsys):
     """The start fell in all: a tuning has nowhere to begin, and another log may."""
     next_walk(folder, ("ahead",))
@@ -397,21 +372,25 @@ def test_the_best_set_is_called_clear_by_walks_that_did_not_choose_it(folder, en
     assert "not distinguishable" not in text
 
 
-def test_a_gain_that_only_the_walk_that_chose_the_set_shows_is_not_called_clear(
-    folder, ended, capsys
+@pytest.mark.parametrize(
+    ("walked", "told", "again"),
+    [
+        ({"error": 0.0195}, "in walks that did not choose it: not distinguishable", False),
+        ({"fall_at": 0.04}, "walk 3: fell; best is walk 2, fell, in walks that did not", False),
+        ({"error": 0.0105}, "in walks that did not choose it\n", True),
+    ],
+    ids=["little gain", "a fall", "a gain"],
+)
+def test_a_walk_of_the_best_set_is_told_and_undone_and_the_same_set_waits(
+    folder, ended, capsys, walked, told, again
 ):
-    ended(0.02, 0.015, 0.01)
-    propose.run_add(Add(folder, (plain("ahead", "last.npz", error=0.0195),)))
-    text = capsys.readouterr().out
-    assert "in walks that did not choose it: not distinguishable from the start" in text
-    assert read(folder).again.clear is False
-
-
-def test_a_walk_of_the_best_set_is_undone_and_the_same_set_waits(folder, ended, capsys):
+    """A gain that only the walk that chose the set shows is not called clear; a fall is none."""
     ended(0.02, 0.015, 0.01)
     before = content(folder)
-    add(folder, plain("ahead", "last.npz", error=0.0105))
-    capsys.readouterr()
+    propose.run_add(Add(folder, (plain("ahead", "last.npz", **walked),)))
+    assert told in capsys.readouterr().out
+    assert read(folder).again.clear is again
+    assert (read(folder).again.change is None) == ("fall_at" in walked)
     add(folder, undo=True)
     undone = result(capsys)
     assert (undone["walk"], undone["weights"]) == (3, "robot/weights/3.json")
@@ -421,13 +400,6 @@ def test_a_walk_of_the_best_set_is_undone_and_the_same_set_waits(folder, ended, 
     assert now.pop(str(Path(*undone["logs"]).relative_to(folder))) == Path("last.npz").read_bytes()
     assert now == before
     assert read(folder).again is None
-
-
-def test_a_fall_of_the_best_set_is_no_change_of_the_loss(folder, ended, capsys):
-    ended(0.02, 0.015, 0.01)
-    propose.run_add(Add(folder, (plain("ahead", "last.npz", fall_at=0.04),)))
-    assert "walk 3: fell; best is walk 2, fell, in walks that did not" in capsys.readouterr().out
-    assert read(folder).again == (None, False)
 
 
 def test_again_compares_the_cases_in_which_all_stood(folder, ended, capsys):

@@ -20,13 +20,7 @@ from hector_jax.control.weights import directions, nominal, vector_to_weights, w
 from hector_jax.core.tree import stack
 from hector_jax.grfm.effect import last_command
 from hector_jax.tuning import batch, difftune
-from hector_jax.tuning.batch import (
-    PER_CALL,
-    BatchProblem,
-    BatchScenario,
-    tail_weights,
-    tune_batch,
-)
+from hector_jax.tuning.batch import PER_CALL, BatchProblem, BatchScenario, tail_weights, tune_batch
 from hector_jax.tuning.difftune import TuneConfig, tune
 from hector_jax.tuning.evaluate import Evaluation, Objective
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas

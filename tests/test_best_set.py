@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from model import BEST_OTHERS, CONFIG, ROBOT
 
-from hector_jax.cli import arguments, run_folder
-from hector_jax.cli.flags import Tune
+from hector_jax.cli import arguments
 from hector_jax.control.parameters import GROUPS
 from hector_jax.control.weights import nominal
 from hector_jax.core.inputs import InputError
@@ -67,11 +66,6 @@ def test_a_budget_with_which_no_second_set_walks_is_one_line(given, commands, wo
     assert str(error.value) == f"--walks must be 0 or {words}"
 
 
-def test_a_budget_that_is_too_small_is_told_before_there_is_a_run():
-    with pytest.raises(InputError, match=r"--walks must be 0 or at least 6 \(3 commands on 1 pl"):
-        run_folder.trajectories(Tune(traj=("all",), walks=5), ROBOT)
-
-
 def test_best_is_tuned_with_numbers_of_its_own_and_smoothly_where_asked():
     start = nominal()._replace(others={"footstep_width": np.array(0.09)})
     config, at = best_set.settings_of_best(CONFIG, ROBOT, start, smooth=3.0, safe=0.05)
@@ -81,8 +75,3 @@ def test_best_is_tuned_with_numbers_of_its_own_and_smoothly_where_asked():
     assert config.others == GROUPS["integral"]
     assert config.rollout == CONFIG.rollout
     jax.tree.map(np.testing.assert_array_equal, at[:2], start[:2])
-
-
-def test_a_limit_of_the_position_error_is_set_once():
-    with pytest.raises(InputError, match="--safe sets the position limit, which --start has"):
-        run_folder.trajectories(Tune(safe=0.05, start="best"), ROBOT)

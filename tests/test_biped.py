@@ -49,6 +49,7 @@ def test_the_description_of_hector_says_what_the_code_takes_by_default():
         ("stance = 22", 'stance = "22"', "gait: stance must be a whole number.*got '22'"),
         ("kp = [150,", "kp = [", r"legs.kp must be a gain for each of the 5 joints.*got \(150.0,"),
         ("[mpc]", "[mpc]\nstep_ticks = 1", "robot.toml: gait.tick must be at most half"),
+        ("[mpc]", "[mpc]\nconstraints = ['frictoin']", "did you mean 'friction'"),
         ('"left_yaw", ', "", "joints: left and right must be 3 to 7 names each.*got 4 and 5"),
         ("linkage = [5, 4]", "linkage = [6, 4]", "joints: linkage must be two.*from 1 to 5"),
         ("l.euler = 50", "l.euler = [50, 0, 50]", r"nominal: euler must be a number.*got \[50, 0"),

@@ -10,22 +10,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from model import BEST_OTHERS, EXAMPLES, small_net
+from model import BEST_OTHERS, EXAMPLES, ROBOT, small_net
 from pretend import call, instead, refused
 from synthetic import synthetic_walk
-from test_walks import HandsOver
 
 from hector_jax.cli import arguments, doctor
 from hector_jax.cli.flags import COMMANDS, Tune
 from hector_jax.cli.parse import from_file
 from hector_jax.control.parameters import GROUPS
-from hector_jax.control.weights import weight_names, weights_to_vector
-from hector_jax.control.weights_file import load_weights
-from hector_jax.core.files import write_json
+from hector_jax.control.weights import nominal, weight_names, weights_to_vector
+from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.grfm.network import save_net
 from hector_jax.robot.description import MODEL_PATH
-from hector_jax.robot.model import load_robot
 from hector_jax.store import nets
 from hector_jax.store.nets import CollectConfig, TrainedNet
 
@@ -106,51 +103,85 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
     assert found["residual"] is None
 
 
-@pytest.mark.parametrize(
-    ("words", "fault"),
-    [
-        ("walk --weights exprt", "'exprt'; did you mean 'expert'?"),
-        ("tune --traj circle", "straight, c, s"),
-        ("steps collect --seconds 0.001", "at least 0.03 s, the 3 ticks of one sample, got 0.001"),
-        ("steps collect --walks 2", "--walks must be a whole number from 3 to"),
-    ],
-)
+FILES = {  # that the lines below name
+    "list/config.json": "[]",
+    "mine.py": "",
+    "mine.toml": 'name = "short"\n[[segment]]\nseconds = 2.0\nv_x = 0.2\n',
+    "no.sh": "#!/bin/sh\n",
+    "own.toml": "model = ''\n",
+    "runs/kept": "mine",
+    "walks/card.json": '{"walks": 4, "settings": {"walks": 4}}',
+    "elsewhere.toml": "model = 'sub/robot.xml'\n",
+    "folder.toml": "model = '.'\n",
+    "root.toml": "model = '/'\n",
+}
+BESIDE = "model must name a file beside it"
+STRIDER = "--robot examples/strider/robot.toml"
+REFUSED = [
+    ("walk --weights exprt", "'exprt'; did you mean 'expert'?"),
+    ("walk --gait trot", "--gait: trot is for 4 legs, not 2"),
+    (f"walk --weights best {STRIDER}", "strider/robot-best.json; tune this robot"),
+    ("walk --traj examples/slalom.toml --seconds 4", "slalom lasts 6 s, as its file says, got 4"),
+    ("walk --traj examples/slalom.toml --seconds 2 --out never.npz", "got 2"),
+    (f"tune --start best {STRIDER}", "strider/robot-best.json; tune this robot"),
+    ("tune --traj circle", "straight, c, s"),
+    ("tune --traj c mine.toml", "of one length, got c 4 s, short 2 s"),
+    ("tune --traj all --walks 5", "--walks must be 0 or at least 6 (3 commands on 1 pl"),
+    ("tune --safe 0.05 --start best", "--safe sets the position limit, which --start has"),
+    ("tune --net net.npz --variant paper", "net.npz: holds grfm-residual, expected grfm-paper"),
+    ("tune --out runs --data runs", "exists"),
+    ("tune --walker mine.py", "--walker needs --walks"),
+    ("tune --walker mine.py --walks 20 --safe 0.1", "--safe is for this project's controller"),
+    ("steps collect --seconds 0.001", "at least 0.03 s, the 3 ticks of one sample, got 0.001"),
+    ("steps collect --walks 2", "--walks must be a whole number from 3 to"),
+    ("steps collect --walks 5 --out walks", "walks: made"),
+    ("robot own.toml", "model is missing"),
+    ("robot elsewhere.toml", BESIDE),
+    ("robot folder.toml", BESIDE),
+    ("robot root.toml", BESIDE),
+    ("view runs --out shown", "runs/config.json: cannot read a file of a run of"),
+    ("view list --out shown", "list/config.json: expected a JSON object"),
+    ("evaluate --world ideal --seeds 8", "--seeds 8: --world ideal is one plant"),
+    ("evaluate --world hfs --first-seed 3", "--first-seed 3: --world hfs is one plant"),
+    ("evaluate --walker mine.py --engine c", "--engine and --walker: only one can be given"),
+    ("evaluate --walker no.sh", "chmod +x"),
+    ("evaluate --walker mine.py --walker-uses gone", "gone: no such file or folder"),
+    (
+        "evaluate --weights expert --out out",
+        "--weights must be nominal, which changes are against, and",
+    ),
+    ("evaluate --weights nominal nominla", "got 'nominla'; did you mean 'nominal'?"),
+    ("evaluate --weights nominal expert=c.json", "there is a set 'expert' already; use NAME="),
+    ("evaluate --weights nominal list", "straight.json: cannot read"),
+    ("evaluate --weights nominal .", "straight.json: cannot read"),
+    ("evaluate --engine all c", "--engine all stands alone, got all c"),
+    ("evaluate --plant light light", "--plant names 'light' twice"),
+    ("evaluate --runs runs --seeds 3", "--runs compares what has walked already, so not beside"),
+    ("evaluate --first-seed 4294967293 --seeds 1 --plant heavy", "the largest is 4294967295"),
+]
+
+
+@pytest.fixture(scope="module")
+def named(tmp_path_factory):
+    """A folder with what the refused lines name."""
+    folder = tmp_path_factory.mktemp("named")
+    for name, text in FILES.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text(text)
+    (folder / "examples").symlink_to(EXAMPLES)
+    save_net(folder / "net.npz", small_net(), robot=ROBOT, about={})
+    save_weights(folder / "c.json", nominal())
+    return folder
+
+
+@pytest.mark.parametrize(("line", "fault"), REFUSED)
 def test_wrong_input_is_one_line_before_anything_is_computed(
-    monkeypatch, capsys, tmp_path, words, fault
+    monkeypatch, capsys, named, line, fault
 ):
-    monkeypatch.chdir(tmp_path)
-    assert fault in refused(monkeypatch, capsys, *words.split())
-    assert not list(tmp_path.glob("[!.]*"))
-
-
-def test_a_robot_without_a_best_set_says_so(monkeypatch, capsys, tmp_path):
-    robot = EXAMPLES / "strider" / "robot.toml"
-    told = f"no {robot.with_name('robot-best.json')}; tune this robot"
-    for words in (
-        ("walk", "--weights", "best"),
-        ("tune", "--start", "best", "--out", tmp_path / "run"),
-    ):
-        assert told in refused(monkeypatch, capsys, *words, "--robot", robot)
-    assert not (tmp_path / "run").exists()
-
-
-def test_the_set_that_comes_along_fills_a_template_and_the_file_is_told(
-    monkeypatch, capsys, tmp_path
-):
-    monkeypatch.chdir(tmp_path)
-    Path("gains.yaml.j2").write_text("{{ Q.euler[0] }}")
-    words = ("--template", "gains.yaml.j2", "--out", "out", "--json")
-    assert call(monkeypatch, "export", "best", *words) == 0
-    assert json.loads(capsys.readouterr().out) == {"file": "out/gains.yaml"}
-    assert float(Path("out/gains.yaml").read_text()) > 0.0
-
-
-def test_a_net_of_another_variant_is_refused_before_there_is_a_run(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    save_net(Path("net.npz"), small_net(), robot=load_robot(), about={})
-    line = refused(monkeypatch, capsys, "tune", "--net", "net.npz", "--variant", "paper")
-    assert "net.npz: holds grfm-residual, expected grfm-paper" in line
-    assert not Path("runs").exists()
+    monkeypatch.chdir(named)
+    before = {path for path in named.rglob("*") if path.name != ".lock"}
+    assert fault in refused(monkeypatch, capsys, *line.split())
+    assert {path for path in named.rglob("*") if path.name != ".lock"} == before
 
 
 def test_a_step_with_settings_of_its_own_leaves_what_a_tuning_reads(monkeypatch, tmp_path):
@@ -167,19 +198,6 @@ def test_a_step_with_settings_of_its_own_leaves_what_a_tuning_reads(monkeypatch,
     for line in ("", "--engine c", "--walks 128", "--walks 128 --out data/walks"):
         assert call(monkeypatch, "steps", "collect", *line.split()) == 0
     assert list(map(str, paths)) == ["data/walks"] * 2 + ["data/walks-walks-128", "data/walks"]
-
-
-def test_walks_of_other_settings_are_refused_before_anything_is_compiled(monkeypatch, tmp_path):
-    monkeypatch.setattr(nets, "compile_programs", None)
-    write_json(tmp_path / "card.json", {"walks": 4, "settings": {"walks": 4}})
-    with pytest.raises(InputError, match=f"^{tmp_path}: made"):
-        nets.collect_walks(HandsOver(), nets.CollectConfig(walks=5), load_robot(), tmp_path)
-
-
-def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
-    (tmp_path / "kept").write_text("mine")
-    assert "exists" in refused(monkeypatch, capsys, "tune", "--out", tmp_path, "--data", tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["kept"]
 
 
 @pytest.mark.slow

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from model import ROBOT
-from synthetic import CYCLE, synthetic_walk, turn_walk, turns
+from pretend import elsewhere
+from synthetic import CYCLE, synthetic_walk, turns
 
 from hector_jax.control.weights import nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.tree import stack
@@ -101,7 +102,7 @@ def test_the_time_since_a_switch_counts_from_the_start_tick(three):
 def test_a_walk_on_another_heading_makes_the_same_samples():
     walk = synthetic_walk(5, TICKS)
     here, _ = make_dataset(ROBOT, walks_of(walk))
-    there, _ = make_dataset(ROBOT, walks_of(turn_walk(walk, 2.1)))
+    there, _ = make_dataset(ROBOT, walks_of(elsewhere(walk, (0.0, 0.0), 2.1)))
     leaves_close(here.window, there.window, 1e-10)
     leaves_close(here.label, there.label, 1e-10)
     leaves_close(here.legs, there.legs, 1e-8)
@@ -166,7 +167,7 @@ def test_a_collection_of_something_else_is_not_overwritten(tmp_path):
     before = (tmp_path / "walk-00000.npz").read_bytes()
     for seed, ticks, fault in (
         (1, 4, "made with jobs"),
-        (0, 5, "made with ticks 4, this command expects 5"),
+        (0, 5, "made with ticks 4, this command expects 5; remove it, or name another"),
     ):
         jobs, settings = draw_jobs(seed, 2), {"ticks": ticks}
         with pytest.raises(ValueError, match=f": {fault}"):

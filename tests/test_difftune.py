@@ -13,23 +13,11 @@ from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.parameters import bounds
 from hector_jax.control.reference import COMMANDS, named_command
-from hector_jax.control.weights import (
-    directions,
-    expert,
-    nominal,
-    vector_to_weights,
-)
+from hector_jax.control.weights import directions, expert, nominal, vector_to_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Wrench
 from hector_jax.grfm.effect import last_command
-from hector_jax.tuning.difftune import (
-    TuneConfig,
-    descend,
-    init,
-    trial_weights,
-    tune,
-    update,
-)
+from hector_jax.tuning.difftune import TuneConfig, descend, init, trial_weights, tune, update
 from hector_jax.tuning.evaluate import Evaluation, Objective, aligned
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig, Scenario
@@ -277,6 +265,7 @@ def test_a_trust_region_holds_shares_of_boxes_as_it_holds_logs():
     [
         ("turn_laed", "relative", {}, "did you mean 'turn_lead'"),
         ("foot_height", "relative", {}, "foot_height cannot be tuned by gradients"),
+        ("kp", "relative", {}, "kp cannot be tuned by gradients"),
         ("friction", "literal", {}, "others must be empty with the rule literal"),
         ("turn_lead", "relative", {"footstep": FootstepConfig(rule="paper")}, "no part in the pap"),
         ("friction", "relative", {"mpc": MpcConfig(friction=0.05)}, "starts at 0.05, expected fro"),

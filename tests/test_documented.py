@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from pretend import call
+from pretend import HandsOver, call
 from test_docs import READ, README, ROOT, lines_of
-from test_walks import HandsOver
 
 from hector_jax.cli import commands, evaluate, flags, propose, tune, walk, walker
 from hector_jax.control.weights import expert

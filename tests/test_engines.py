@@ -5,10 +5,10 @@ from functools import cache
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from model import ROOT
+from oracles import mass_matrix
 
 from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import named_command
@@ -16,7 +16,6 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.headless import mujoco
 from hector_jax.robot.model import load_robot
-from hector_jax.sim.actuators import init_actuators, step_actuators
 from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
@@ -84,8 +83,7 @@ def test_the_mass_matrix_is_that_of_mujoco(engine, file, backlash, close):
         data.qpos[:] = rng.uniform(-1.0, 1.0, model.nq)
         data.qpos[3:7] /= np.linalg.norm(data.qpos[3:7])
         mujoco.mj_forward(model, data)
-        ours, turn, R = np.zeros((model.nv, model.nv)), np.eye(model.nv), np.zeros(9)
-        mujoco.mj_fullM(model, data, ours)
+        ours, turn, R = mass_matrix(model, data), np.eye(model.nv), np.zeros(9)
         mujoco.mju_quat2Mat(R, data.qpos[3:7])
         theirs, in_trunk = engine.mass_matrix(other, data.qpos)
         if in_trunk:
@@ -93,20 +91,6 @@ def test_the_mass_matrix_is_that_of_mujoco(engine, file, backlash, close):
         else:
             turn[3:6, 3:6] = R.reshape(3, 3).T
         np.testing.assert_allclose(theirs, turn.T @ ours @ turn, atol=close * np.abs(ours).max())
-
-
-def test_no_joint_gets_more_than_its_limit_through_the_linkage_either():
-    """MuJoCo's actuators limit the sum; the other engines apply what `step_actuators` returns."""
-    plant = ideal()._replace(linkage=np.array(0.5))
-    limit = HECTOR.torque_limit
-    np.testing.assert_array_equal(
-        build_world(plant, HECTOR.description).model.actuator_ctrlrange[:, 1], limit
-    )
-    for sign in (1.0, -1.0):
-        _, torque = step_actuators(HECTOR, plant, init_actuators(10), sign * 1e3 * jnp.ones(10))
-        np.testing.assert_allclose(torque, sign * limit)
-    _, torque = step_actuators(HECTOR, plant, init_actuators(10), jnp.ones(10))
-    assert torque[3] == pytest.approx(1.5)  # the knee, and half of the ankle
 
 
 @pytest.mark.parametrize("plant", WORLDS)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pretend import call, instead, pretend_score, pretend_walk, refused
+from pretend import call, instead, pretend_score, pretend_walk
 
 from hector_jax.cli import evaluate as command
 from hector_jax.control.weights import expert, nominal
@@ -190,31 +190,3 @@ def test_a_named_set_is_not_a_folder_of_that_name(monkeypatch, tmp_path, capsys,
     assert call(monkeypatch, "evaluate", "--traj", "s", "--seeds", 1, "--weights", "nominal") == 0
     assert [float(job.weights.Q.euler[0]) for _, job in walked.jobs] == [nominal().Q.euler[0]]
     assert capsys.readouterr().out.startswith("s, 1 plant on the hardware stand-in\n")
-
-
-@pytest.mark.parametrize(
-    ("words", "fault"),
-    [
-        ("--weights expert", "--weights must be nominal, which changes are against, and"),
-        ("--weights nominal nominla", "got 'nominla'; did you mean 'nominal'?"),
-        ("--weights nominal expert={file}", "there is a set 'expert' already; use NAME="),
-        ("--weights nominal {folder}", "straight.json: cannot read"),
-        ("--weights nominal .", "straight.json: cannot read"),
-        ("--engine pinocchio", "Pinocchio is not installed"),
-        ("--engine all c", "--engine all stands alone, got all c"),
-        ("--plant light light", "--plant names 'light' twice"),
-        ("--runs {runs} --seeds 3", "--runs compares what has walked already, so not beside"),
-        ("--first-seed 4294967293 --seeds 1 --plant heavy", "the largest is 4294967295"),
-    ],
-)
-def test_wrong_input_is_one_line_before_anything_is_walked(
-    monkeypatch, tmp_path, capsys, walked, words, fault
-):
-    file = tmp_path / "sets" / "c.json"
-    save_weights(file, nominal())
-    runs = tmp_path / "runs"
-    runs.mkdir()
-    words = words.format(file=file, folder=file.parent, runs=runs).split()
-    assert fault in refused(monkeypatch, capsys, "evaluate", "--out", tmp_path / "out", *words)
-    assert walked.jobs == []
-    assert not (tmp_path / "out").exists()

@@ -92,8 +92,3 @@ def test_a_mirrored_robot_steps_to_the_mirrored_points_and_a_yawed_one_to_the_ya
     other, other_yaw = feet(turned(now), turned(wanted), config)
     np.testing.assert_allclose(other, points @ R.T, atol=1e-12)
     np.testing.assert_allclose(other_yaw, yaw + 1.1)
-
-
-def test_an_unknown_rule_is_refused():
-    with pytest.raises(ValueError, match="'raibert' or 'paper', got 'guess'"):
-        FootstepConfig(rule="guess")

@@ -1,28 +1,20 @@
-"""A robot with four legs as data: what is found, proposed, read, and what is refused."""
+"""A robot with four legs as data: what is found, proposed, and read."""
 
 import re
 import tomllib
 from dataclasses import replace
 
-import jax
-import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 from model import EXAMPLES, QUADRUPED
 from pretend import call
+from published import replaced
 
-from hector_jax.control.controller import walk_config
-from hector_jax.control.legs import stance_torques
-from hector_jax.core.inputs import InputError
-from hector_jax.core.trajectory import FEET, State, Wrench
+from hector_jax.core.trajectory import FEET
 from hector_jax.importing.propose import propose_robot
 from hector_jax.importing.remarks import remarks
 from hector_jax.importing.survey import survey_file
-from hector_jax.robot.checks import standing_data
-from hector_jax.robot.description import description_of
-from hector_jax.robot.kinematics import leg_gravity
-from hector_jax.robot.model import compile_model, robot_of
+from hector_jax.robot.model import robot_of
 
 FILE = EXAMPLES / "quadruped" / "robot.toml"
 MODEL = FILE.with_name("quadruped.xml")
@@ -32,12 +24,8 @@ TABLE = FILE.read_text()
 
 def changed(folder, *changes):
     """The model with some of its text replaced."""
-    text = MODEL.read_text()
-    for old, new in changes:
-        assert re.search(old, text)
-        text = re.sub(old, new, text)
     path = folder / "quadruped.xml"
-    path.write_text(text)
+    path.write_text(replaced(MODEL.read_text(), *changes))
     return path
 
 
@@ -158,57 +146,3 @@ def test_pairs_that_are_not_alike_are_refused(tmp_path):
     hind = (r'(?s)(hind_\w+)_calf".*?<geom class="foot"/>', rf"\g<0>{toe}")
     error = propose_robot(changed(tmp_path, hind)).error
     assert "2 pairs of chains of [4, 3] hinges end as low as legs" in error
-
-
-def test_joint_torques_of_four_feet_are_the_statics_of_mujoco():
-    data = standing_data(QUADRUPED.description, compile_model(QUADRUPED.description))
-    points = np.array([data.site(foot.point).xpos for foot in QUADRUPED.description.named_feet])
-    arms = points - data.subtree_com[1]
-    # the least vertical forces that balance weight and moments
-    A = np.stack([np.ones(4), arms[:, 0], arms[:, 1]])
-    weight = float(QUADRUPED.mass * QUADRUPED.gravity[2])
-    force = np.linalg.lstsq(A, [weight, 0.0, 0.0])[0][:, None] * [0.0, 0.0, 1.0]
-    need = data.qfrc_bias.copy()
-    for foot, of_foot in zip(QUADRUPED.description.named_feet, force, strict=True):
-        J = np.zeros((3, len(need)))
-        mujoco.mj_jacSite(data.model, data, J, None, data.site(foot.point).id)
-        need -= J.T @ of_foot
-    np.testing.assert_allclose(need[:6], 0.0, atol=1e-9)
-    joints = jnp.asarray(QUADRUPED.standing_joints)
-    state = State(*jnp.zeros((4, 3)))._replace(position=jnp.asarray(data.subtree_com[1]))
-    wrench = Wrench(jnp.asarray(force), jnp.zeros((4, 3)))
-    held = jax.jit(leg_gravity)(QUADRUPED, joints, jnp.asarray(QUADRUPED.gravity))
-    found = jax.jit(stance_torques)(QUADRUPED, state, joints, wrench) + held
-    np.testing.assert_allclose(found, need[6:], atol=1e-8)
-
-
-def swap_hind_legs(table):
-    for part in (table["joints"], table["feet"]):
-        part["hind_left"], part["hind_right"] = part["hind_right"], part["hind_left"]
-
-
-WRONG = {
-    "must have left, right; or front_left, front_right, hind_left, hind_right, got front_left, "
-    "front_right, hind_left$": lambda t: t["feet"].pop("hind_right"),
-    "joints: must have .* got left, front_left": lambda t: t["joints"].update(left=["a", "b", "c"]),
-    "feet.hind_left.body is 'front_left_calf', expected one that joint 'hind_left_knee'": (
-        lambda t: t["feet"]["hind_left"].update(body="front_left_calf")
-    ),
-    "different names, got 'front_left_roll' twice": (
-        lambda t: t["joints"].update(hind_left=t["joints"]["front_left"])
-    ),
-    r"as many contacts, got \[2, 1, 1, 1\]": (
-        lambda t: t["feet"].update(front_left={"point": "sole", "toe": "toe", "heel": "heel"})
-    ),
-    "the hind_left foot at y = -0.142, expected it left of the hind_right one": swap_hind_legs,
-    "expert: missing field 'moment'": lambda t: t["weights"]["expert"].pop("moment"),
-}
-
-
-@pytest.mark.parametrize("words", WRONG)
-def test_what_is_wrong_is_told_in_one_line(words):
-    table = tomllib.loads(TABLE)
-    WRONG[words](table)
-    with pytest.raises(InputError, match=words) as error:
-        walk_config(robot_of(description_of(FILE, table)))
-    assert "\n" not in str(error.value)

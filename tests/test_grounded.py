@@ -1,15 +1,14 @@
 """Rollouts grounded on a measured walk: the walk itself, and its slope."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from model import AHEAD, ANCHOR, BRIEF, PLAIN, ROBOT
+from pretend import elsewhere, no_belief
 
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import nominal, vector_to_weights, weights_to_vector
 from hector_jax.control.weights_file import best
-from hector_jax.core.geometry import rot_z
 from hector_jax.core.trajectory import State, Wrench, no_samples
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
@@ -31,8 +30,7 @@ def shaking(size):
     shake = size * rng.standard_normal((ticks, 3))
     state = State(shake, shake + place, shake, shake)
     force = np.broadcast_to(np.asarray(ROBOT.mass * ROBOT.gravity) / 2, (ticks, 2, 3))
-    empty = no_samples(10, 2)
-    return empty._replace(
+    return no_samples(10, 2)._replace(
         period=np.array(0.01),
         initial=jax.tree.map(lambda x: x[0] - shake[0], state),
         state=state,
@@ -40,29 +38,13 @@ def shaking(size):
         joints=np.broadcast_to(ROBOT.standing_joints, (ticks, 10)),
         fallen=np.zeros(ticks, bool),
         residual=np.zeros(ticks),
-        belief=jax.tree.map(lambda x: np.zeros((ticks, *x.shape[1:])), empty.belief),
+        belief=no_belief(ticks),
     )
 
 
 @pytest.fixture(scope="module")
 def measured():
     return shaking(1e-3)
-
-
-def from_yaw(walk, yaw):
-    """The same walk of a robot that begins with another heading [rad]."""
-    R = np.asarray(rot_z(jnp.asarray(yaw)))
-
-    def turned(state):
-        vectors = (x @ R.T for x in (state.position, state.ang_velocity, state.velocity))
-        position, rates, velocity = vectors
-        return State(state.euler + [0.0, 0.0, yaw], position, rates, velocity)
-
-    return walk._replace(
-        initial=turned(walk.initial),
-        state=turned(walk.state),
-        command=Wrench(walk.command.force @ R.T, walk.command.moment @ R.T),
-    )
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +108,7 @@ def test_with_the_weights_of_a_log_the_planned_commands_are_those_of_the_log(noi
 
 def test_residuals_turn_with_the_robot():
     """An error of the model that is the same for the robot is the same at each heading."""
-    walks = shaking(1e-2), from_yaw(shaking(1e-2), 0.7)
+    walks = shaking(1e-2), elsewhere(shaking(1e-2), (0.0, 0.0), 0.7)
     found, there = (fit_grounding(BRIEF, SCENARIO, nominal(), x) for x in walks)
     assert np.abs(there.residuals.state.velocity).max() > 1e-2
     for a, b in zip(found.residuals.state[1:], there.residuals.state[1:], strict=True):

@@ -11,7 +11,7 @@ from types import ModuleType
 import numpy as np
 import optax
 import pytest
-from model import CONFIG, ROBOT
+from model import CONFIG, ROBOT, robot_with
 
 from hector_jax.control.contact import InputConstraint, Rows
 from hector_jax.control.mpc import MpcConfig
@@ -22,7 +22,6 @@ from hector_jax.core import environment, identity
 from hector_jax.core.environment import code_hash
 from hector_jax.core.identity import function_id
 from hector_jax.qp import INTERIOR_POINT, QpConfig, Solver
-from hector_jax.robot.description import TuningSettings
 from hector_jax.sim.engine import ENGINES, MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
@@ -33,11 +32,6 @@ from hector_jax.tuning.loss import PAPER_LOSS, LossTerm
 
 key = partial(content_key, code=())
 JOB = Job(nominal(), named_command("s"), hfs())
-
-
-def robot_with(**settings):
-    description = replace(ROBOT.description, tuning=TuningSettings(**settings))
-    return ROBOT._replace(description=description)
 
 
 def loss_with(k):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from model import ROBOT
+from model import QUADRUPED, ROBOT, WEIGHT
 
 from hector_jax.control.footstep import Feet
 from hector_jax.control.legs import (
@@ -21,13 +21,12 @@ from hector_jax.control.legs import (
 )
 from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.trajectory import State, Wrench
-from hector_jax.robot.description import Description
+from hector_jax.robot.checks import standing_data
 from hector_jax.robot.kinematics import foot_poses, leg_gravity
-from hector_jax.robot.model import compile_model, describe
+from hector_jax.robot.model import compile_model
 
 CONFIG = LegConfig()
 SWING = 0.2
-WEIGHT = float(ROBOT.mass * ROBOT.gravity[2])
 STANDS = jnp.asarray(ROBOT.standing_joints)
 
 stance = jax.jit(lambda state, joints, wrench: stance_torques(ROBOT, state, joints, wrench))
@@ -95,33 +94,40 @@ def test_stance_torques_and_ground_do_no_work_together_at_the_hip():
         assert float(torque @ rates) == pytest.approx(-float(power), abs=1e-10)
 
 
-def statics(share):
-    """MuJoCo's joint torques of the standing pose when the left foot carries `share` of it."""
-    model = compile_model(describe())
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, model.key(Description.standing).id)
-    mujoco.mj_forward(model, data)
-    feet = np.array(
-        [data.site(name).xpos for name in [foot.point for foot in Description().named_feet]]
-    )
-    com = data.subtree_com[1]
-    force = WEIGHT * np.array([[0.0, 0.0, share], [0.0, 0.0, 1.0 - share]])
-    # moments that bring the centre of pressure under the centre of mass
-    moment = np.cross(com - feet, force)
+def statics(robot, share):
+    """MuJoCo's joint torques of the standing pose when feet carry these shares of it.
+
+    Moments bring the centre of pressure under the centre of mass where feet exert some; of four
+    point feet shares are the least that balance.
+    """
+    model = compile_model(robot.description)
+    data = standing_data(robot.description, model)
+    sites = [data.site(foot.point) for foot in robot.description.named_feet]
+    arms = np.array([site.xpos for site in sites]) - data.subtree_com[1]
+    if share is None:
+        A = np.stack([np.ones(4), arms[:, 0], arms[:, 1]])
+        share = np.linalg.lstsq(A, [1.0, 0.0, 0.0])[0]
+    force = float(robot.mass * robot.gravity[2]) * np.outer(share, [0.0, 0.0, 1.0])
+    moment = np.zeros((4, 3)) if len(sites) == 4 else np.cross(-arms, force)
     need = data.qfrc_bias.copy()
-    for foot, name in enumerate([foot.point for foot in Description().named_feet]):
-        J_v, J_w = np.zeros((3, model.nv)), np.zeros((3, model.nv))
-        mujoco.mj_jacSite(model, data, J_v, J_w, model.site(name).id)
+    for foot, site in enumerate(sites):
+        J_v, J_w = np.zeros((2, 3, model.nv))
+        mujoco.mj_jacSite(model, data, J_v, J_w, site.id)
         need -= J_v.T @ force[foot] + J_w.T @ moment[foot]
     np.testing.assert_allclose(need[:6], 0.0, atol=1e-9)  # the trunk needs no help
-    return need[6:], Wrench(jnp.asarray(force), jnp.asarray(moment))
+    state = State(*jnp.zeros((4, 3)))._replace(position=jnp.asarray(data.subtree_com[1]))
+    return need[6:], state, Wrench(jnp.asarray(force), jnp.asarray(moment))
 
 
-@pytest.mark.parametrize("share", [0.5, 1.0])
-def test_stance_torques_and_leg_weight_are_the_statics_of_mujoco(share):
-    need, wrench = statics(share)
-    weight = carried(STANDS, jnp.asarray(ROBOT.gravity))
-    np.testing.assert_allclose(stance(base(), STANDS, wrench) + weight, need, atol=1e-8)
+@pytest.mark.parametrize(
+    ("robot", "share"), [(ROBOT, (0.5, 0.5)), (ROBOT, (1.0, 0.0)), (QUADRUPED, None)]
+)
+def test_stance_torques_and_leg_weight_are_the_statics_of_mujoco(robot, share):
+    need, state, wrench = statics(robot, share)
+    joints = jnp.asarray(robot.standing_joints)
+    weight = jax.jit(leg_gravity)(robot, joints, jnp.asarray(robot.gravity))
+    found = jax.jit(stance_torques)(robot, state, joints, wrench) + weight
+    np.testing.assert_allclose(found, need, atol=1e-8)
 
 
 # Swing

@@ -8,14 +8,11 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
-from model import EXAMPLES
 from pretend import refused
 
-from hector_jax.cli import commands
 from hector_jax.cli.flags import COMMANDS, Evaluate, Export, Tune, View, Walk, named_file
 from hector_jax.cli.parse import check_flags, from_line, resolve_latest
 from hector_jax.core.files import write_json
-from hector_jax.core.inputs import InputError
 
 
 def test_flags_are_taken_in_any_order_and_spelling():
@@ -143,30 +140,6 @@ def test_latest_is_the_tuning_that_began_last(monkeypatch, capsys, tmp_path):
     assert found == Tune(resume=Path("runs/refused"))  # perhaps it was cut
     (tmp_path / "latest").mkdir()  # one that is there under that name is meant
     assert resolve_latest(from_line(["view", "latest"])).run == Path("latest")
-
-
-SLALOM = EXAMPLES / "slalom.toml"
-STRIDER = EXAMPLES / "strider" / "robot.toml"
-
-
-@pytest.mark.parametrize(
-    ("line", "fault"),
-    [
-        (f"walk --traj {SLALOM} --seconds 4", "slalom lasts 6 s, as its file says, got 4"),
-        ("evaluate --world ideal --seeds 8", "--seeds 8: --world ideal is one plant"),
-        (f"walk --traj {SLALOM} --seconds 2 --out never.npz", "got 2"),
-        ("evaluate --world hfs --first-seed 3", "--first-seed 3: --world hfs is one plant"),
-    ],
-)
-def test_what_is_given_beside_what_already_fixes_it_is_refused(line, fault):
-    with pytest.raises(InputError, match=fault):
-        commands.run(from_line(line.split()))
-
-
-def test_a_word_in_a_file_is_a_list_of_one(tmp_path):
-    (tmp_path / "flags.toml").write_text('weights = "nominal"\n')
-    flags = from_line(["evaluate", "--config", str(tmp_path / "flags.toml")])
-    assert flags.weights == ("nominal",)
 
 
 def test_a_path_with_an_equals_sign_is_a_file_where_there_is_one(monkeypatch, tmp_path):

@@ -2,10 +2,10 @@
 
 from dataclasses import replace
 
-import mujoco
 import numpy as np
 import pytest
 from model import QUADRUPED, ROBOT
+from oracles import mass_matrix
 from scipy.linalg import solve_discrete_are
 
 from hector_jax.control.controller import walk_config
@@ -32,8 +32,7 @@ def test_the_mobility_is_that_of_a_robot_whose_stance_feet_do_not_move(robot):
     answer = response(robot)
     model = compile_model(robot.description)
     data, nv = standing_data(robot.description, model), model.nv
-    M = np.zeros((nv, nv))
-    mujoco.mj_fullM(model, data, M)
+    M = mass_matrix(model, data)
     J = np.concatenate(answer.twists[answer.stance][:, answer.held])
     zero = np.zeros((len(J), len(J)))
     solved = np.linalg.solve(np.block([[M, J.T], [J, zero]]), np.eye(nv + len(J)))[:nv, :nv]
@@ -83,8 +82,6 @@ def test_the_plan_turns_its_share_of_the_inertia():
     np.testing.assert_allclose(found[0], [0.25, 0.5, 0.35])
     with pytest.raises(InputError, match=r"MpcConfig.inertia_share must .* above 0 and at most 1"):
         MpcConfig(inertia_share=(0.0, 1.0, 1.0))
-    with pytest.raises(InputError, match="MpcConfig.inertia_share must be 3 numbers"):
-        MpcConfig(inertia_share=(1.0,))
 
 
 def test_a_delayed_joint_is_stable_up_to_its_phase_margin():

@@ -73,11 +73,6 @@ def test_commands_lead_where_their_names_say(name, seconds, ahead, left, turned)
     np.testing.assert_allclose(state.euler[0, 2], turned, atol=1e-12)
 
 
-def test_unknown_trajectory_is_named():
-    with pytest.raises(ValueError, match="unknown trajectory 'circle'; known: straight, c, s, "):
-        named_command("circle")
-
-
 def test_pieces_without_duration_change_nothing():
     three = Command(np.array([0.7, 1.1, 0.4]), 0.1 * np.ones((3, 2)), np.arange(3.0))
     for command in (named_command("s"), three):

@@ -7,11 +7,10 @@ import mujoco
 import numpy as np
 import pytest
 from model import EXAMPLES
-from published import JOINTS, MOTOR, small, urdf_of
+from oracles import mass_matrix
+from published import HOLD, JOINTS, LINK, by_numbers, replaced, small, urdf_of
 
-from hector_jax.core.inputs import InputError
-from hector_jax.robot.description import MODEL_PATH, Description, Foot, read_description
-from hector_jax.robot.model import robot_of
+from hector_jax.robot.description import MODEL_PATH, Description, read_description
 from hector_jax.robot.source import build_spec
 
 STRIDER = EXAMPLES / "strider" / "robot.toml"
@@ -32,12 +31,6 @@ def contacts_of(description):
     return [name for foot in description.named_feet for name in foot.contacts]
 
 
-def mass_matrix(model, data):
-    M = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, M)
-    return M
-
-
 @pytest.mark.parametrize("path", [None, STRIDER])
 def test_a_model_that_has_the_form_is_left_bit_for_bit(path):
     description = Description() if path is None else read_description(path)
@@ -51,11 +44,7 @@ def test_a_model_that_has_the_form_is_left_bit_for_bit(path):
 
 
 def edited(folder, *changes):
-    text = MODEL_PATH.read_text()
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    (folder / "robot.xml").write_text(text)
+    (folder / "robot.xml").write_text(replaced(MODEL_PATH.read_text(), *changes))
     return Description(model=folder / "robot.xml")
 
 
@@ -80,19 +69,6 @@ def test_solver_height_and_friction_are_mended_and_named_feet_stay(tmp_path):
         np.testing.assert_allclose(ours, theirs, atol=1e-9)
 
 
-def by_numbers(folder, text):
-    """HECTOR's description, feet by places and standing by angles, of another file."""
-    path = folder / "robot.urdf"
-    path.write_text(text)
-    bend = {"hip_pitch": np.pi / 4, "knee": -np.pi / 2, "ankle": np.pi / 4}
-    angles = {f"{s}_{j}": float(a) for s in ("left", "right") for j, a in bend.items()}
-    feet = tuple(
-        Foot((0.0, 0.0, -0.04), ((0.09, 0.0, -0.04), (-0.06, 0.0, -0.04)), f"{side}_foot")
-        for side in ("left", "right")
-    )
-    return Description(model=path, standing=tuple(angles.items()), feet=feet)
-
-
 @pytest.mark.parametrize("world", [False, True])
 def test_a_urdf_is_the_robot_that_its_numbers_are(tmp_path, world):
     hector = mujoco.MjModel.from_xml_path(str(MODEL_PATH))
@@ -111,8 +87,6 @@ def test_a_urdf_is_the_robot_that_its_numbers_are(tmp_path, world):
     np.testing.assert_allclose(
         mass_matrix(model, got), mass_matrix(hector, expected), atol=1e-9, rtol=0
     )
-    with pytest.raises(InputError, match="'left_hip_yaw' has no torque limit"):
-        build_spec(by_numbers(tmp_path, urdf_of(hector, world, effort=False)))
 
 
 TURNED = {  # a body, and a joint that is not zero where the file draws it
@@ -178,37 +152,6 @@ def test_the_limit_of_a_motor_is_the_smallest_that_the_file_states(tmp_path):
     np.testing.assert_array_equal(model.actuator_ctrlrange[:, 1], [20, 20, 15, 20] * 2)
 
 
-MESH = '<geom type="mesh" mesh="thigh" density="900"/>'
-COUPLED = '<equality><joint joint1="left_knee" joint2="left_ankle"/></equality>'
-IN_WORLD = '<worldbody><geom type="{}"/></worldbody>'
-SHORT = '<keyframe><key name="up" qpos="0 0 3"/></keyframe>'
-SHIN_AS_FOOT = (Foot(None, ((0.0, 0.0, 0.0),), "left_shin"),) * 2
-REFUSED = {  # parts of the small biped, and what is told
-    "no mass": ({"shin": ""}, "body 'left_shin' moves and has no mass"),
-    "a mesh's mass": ({"shin": MESH}, "body 'left_shin' has its mass from a mesh"),
-    "joints of no leg": ({"weld": ()}, "joints waist, shoulder are of no leg: add them to weld"),
-    "a misspelt motor": ({"motors": MOTOR.format("left_rol")}, "did you mean 'left_roll'"),
-    "a coupled leg": ({"more": COUPLED}, "couples left_ankle, left_knee"),
-    "terrain": ({"more": IN_WORLD.format('box" size="1 1 0.1')}, "is terrain"),
-    "a low floor": ({"more": IN_WORLD.format('plane" size="1 1 1" pos="0 0 -1')}, "level at z = 0"),
-    "a short keyframe": ({"more": SHORT, "standing": "up"}, "has 3 numbers"),
-    "a shin as foot": ({"feet": SHIN_AS_FOOT}, "feet.left.body is 'left_shin'"),
-    "out of order": (
-        {"joints": (*JOINTS[1::-1], *JOINTS[2:])},
-        "name each leg from the trunk down",
-    ),
-}
-
-
-@pytest.mark.parametrize("kind", REFUSED)
-def test_what_no_robot_can_be_made_of_is_refused_in_one_line(tmp_path, kind):
-    parts, text = REFUSED[kind]
-    with pytest.raises(InputError, match=text) as caught:
-        build_spec(small(tmp_path, **parts))
-    assert str(caught.value).startswith(str(tmp_path))
-    assert "\n" not in str(caught.value)
-
-
 def test_soles_stand_on_the_floor_with_their_spheres_alone(tmp_path):
     description = small(tmp_path)
     model = build_spec(description).spec.compile()
@@ -228,19 +171,12 @@ def test_soles_stand_on_the_floor_with_their_spheres_alone(tmp_path):
     assert kinds == {"mjGEOM_SPHERE", "mjGEOM_BOX", "mjGEOM_CAPSULE"}
 
 
-def test_contacts_are_one_two_or_four_and_level(tmp_path):
+def test_a_sole_may_have_four_contacts(tmp_path):
     corners = tuple((x, y, -0.04) for x in (0.07, -0.05) for y in (0.03, -0.03))
     flat = small(tmp_path, contacts=corners)
     names = [f"{side}_contact_{i}" for side in ("left", "right") for i in range(4)]
     assert contacts_of(flat) == names
     assert all(compiled(flat).geom(name).type == mujoco.mjtGeom.mjGEOM_SPHERE for name in names)
-    with pytest.raises(InputError, match="soles are not level"):
-        robot_of(small(tmp_path, contacts=((0.07, 0.0, -0.04), (-0.05, 0.0, -0.03))))
-    path = tmp_path / "robot.toml"
-    three = "{ body = 'a', contacts = [[0, 0, 0], [1, 0, 0], [0, 1, 0]] }"
-    path.write_text(f"model = 'small.xml'\n[feet]\nleft = {three}\nright = {three}\n")
-    with pytest.raises(InputError, match="1, 2 or 4 contacts"):
-        read_description(path)
 
 
 def test_a_keyframe_of_the_file_is_kept_when_joints_are_welded(tmp_path):
@@ -253,36 +189,11 @@ def test_a_keyframe_of_the_file_is_kept_when_joints_are_welded(tmp_path):
     np.testing.assert_array_equal(got.body_inertia, by_angles.body_inertia)
 
 
-LINK = '<link name="payload"><inertial><mass value="5"/></inertial></link>'
-JOINT = '<joint name="{}" type="fixed"><parent link="{}"/><child link="{}"/></joint>'
-RING = LINK + '<link name="a"/>' + JOINT.format("j", "a", "payload")
-NO_TREE = {  # what is put into a URDF, and what is told
-    "a loose link": (LINK, "no joint holds payload, expected one tree below trunk"),
-    "a repeated link": ('<link name="left_foot"/>', "got ['left_foot'] empty or twice"),
-    "a repeated joint": (JOINT.format("left_knee", "trunk", "trunk"), "got ['left_knee'] empty or"),
-    "no name": ("<link/>", "got [''] empty or twice"),
-    "an unknown link": (JOINT.format("j", "trunk", "arm"), "joint 'j' joins ['trunk', 'arm'], exp"),
-    "one end": ('<joint name="j"><parent link="trunk"/></joint>', "joint 'j' joins ['trunk']"),
-    "two parents": (JOINT.format("j", "trunk", "left_foot"), "no other joint to have this child"),
-    "a ring": (RING + JOINT.format("k", "payload", "a"), "links payload, a hang in a ring"),
-}
-
-
-@pytest.mark.parametrize("kind", NO_TREE)
-def test_links_that_are_no_tree_are_refused_by_name(tmp_path, kind):
-    parts, text = NO_TREE[kind]
-    urdf = urdf_of(mujoco.MjModel.from_xml_path(str(MODEL_PATH)))
-    with pytest.raises(InputError) as caught:
-        build_spec(by_numbers(tmp_path, urdf.replace("</robot>", f"{parts}</robot>")))
-    assert text in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
 def test_the_mass_of_a_urdf_is_that_of_all_its_links_whatever_is_drawn(tmp_path):
     drawn = '<visual><geometry><box size="0 0 0"/></geometry></visual></link>'
     urdf = urdf_of(mujoco.MjModel.from_xml_path(str(MODEL_PATH))).replace("</link>", drawn)
     held = LINK.replace("</i", '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></i')
-    urdf = urdf.replace("</robot>", f"{held}{JOINT.format('hold', 'trunk', 'payload')}</robot>")
+    urdf = urdf.replace("</robot>", f"{held}{HOLD.format('hold', 'trunk', 'payload')}</robot>")
     masses = [float(x) for x in re.findall('<mass value="([^"]*)"', urdf)]
     model = compiled(by_numbers(tmp_path, urdf))
     assert model.body_mass.sum() == pytest.approx(sum(masses), rel=1e-12)
@@ -300,18 +211,15 @@ def test_a_mass_beside_the_robot_is_left_out_and_told(tmp_path):
 def test_names_are_the_files_own_and_what_has_none_gets_one(tmp_path):
     description = small(tmp_path)
     expected, path = compiled(description), description.model
-    text = path.read_text()
-    for old, new in (
+    changes = [
         ('<geom type="box" size="0.05', '<geom name="floor" type="box" size="0.05'),
         ('<body name="[a-z]+_(hip|thigh|shin)"', "<body"),
         ('name="waist" ', ""),
         ("left_knee", "base"),
         ("right_ankle", "floor"),
         ('name="torso"', 'name="floor"'),
-    ):
-        assert re.search(old, text)
-        text = re.sub(old, new, text)
-    path.write_text(text)
+    ]
+    path.write_text(replaced(path.read_text(), *changes))
     names = {"left_knee": "base", "right_ankle": "floor", "waist": "joint_5"}
     renamed = replace(
         description,

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from model import AHEAD, ANCHOR, EXAMPLES, PLAIN, ROBOT
+from model import AHEAD, ANCHOR, EXAMPLES, HEIGHT, PLAIN, ROBOT
 from pretend import call
 
 from hector_jax.control.contact import BOX_FRICTION, TWIST, Constraint
@@ -24,7 +24,6 @@ from hector_jax.robot.model import load_robot
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout, rollout_config
 
 OWN = EXAMPLES / "own_controller"
-HEIGHT = float(ROBOT.standing_height)
 STATE = State(*(jnp.array(x) for x in ([0.05, 0.1, 0.3], [1.0, 2.0, 0.5], [0.1] * 3, [0.4, 0, 0])))
 FEET = Feet(STATE.position + jnp.array([[0.1, 0.08, -0.5], [-0.1, -0.08, -0.45]]), jnp.full(2, 0.2))
 

@@ -1,13 +1,12 @@
 """What the controller does not know: a body, a ground and an estimate that are not as believed."""
 
-from dataclasses import replace
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from model import ANCHOR, ROBOT
+from model import ANCHOR, ROBOT, robot_with
 
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import nominal
@@ -15,7 +14,6 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, Wrench
 from hector_jax.grfm.effect import ground_effect, last_command
 from hector_jax.robot import srbm
-from hector_jax.robot.description import TuningSettings
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 from hector_jax.tuning.rollout import Scenario, rollout, rollout_config, with_variation
 from hector_jax.tuning.variation import (
@@ -124,11 +122,6 @@ def test_the_error_of_the_estimate_has_its_stated_sizes():
     for found, size in zip(draw(jnp.arange(2000)), sizes, strict=True):
         np.testing.assert_allclose(found.std(axis=0), size, rtol=0.1)
         assert (np.abs(found.mean(axis=0)) < 0.1 * size).all()
-
-
-def robot_with(**settings):
-    description = replace(ROBOT.description, tuning=TuningSettings(**settings))
-    return ROBOT._replace(description=description)
 
 
 def test_the_description_of_a_robot_states_the_noise_and_the_delay_of_its_tunings():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from browser import CHROMIUM, opened
 from model import small_net
-from pretend import call, elsewhere, instead, pretend_history, pretend_walk, refused
+from pretend import call, elsewhere, instead, pretend_history, pretend_walk
 
 from hector_jax.cli import arguments
 from hector_jax.cli.flags import Tune
@@ -104,13 +104,6 @@ def test_metrics_of_a_run_that_goes_on_are_read_and_its_newest_weights_taken(tmp
         np.testing.assert_array_equal(weights_to_vector(weights), weights_to_vector(expected))
         assert told == words
         save_weights(run / "weights" / "with.json", expert())
-
-
-def test_what_is_no_run_is_refused_in_one_line(monkeypatch, capsys, tmp_path):
-    for fault in (": cannot read a file of a run of", ": expected a JSON object"):
-        line = refused(monkeypatch, capsys, "view", tmp_path, "--out", tmp_path / "out")
-        assert line.startswith(f"hector: {tmp_path}/config.json{fault}")
-        (tmp_path / "config.json").write_text("[]")
 
 
 def test_a_folder_gets_film_and_pictures_instead(monkeypatch, capsys, tmp_path):

@@ -126,9 +126,12 @@ def test_a_motor_lags_is_weaker_than_told_saturates_and_its_linkage_leaks_into_t
     gain = np.linspace(0.9, 1.0, 10)
     weak = torques(ideal()._replace(torque_gain=gain), np.full((1, 10), 10.0))[0]
     np.testing.assert_allclose(weak, 10.0 * gain)
-    most = torques(ideal(), np.outer([1.0, -1.0], np.full(10, 1e3)))
-    np.testing.assert_allclose(most, np.outer([1.0, -1.0], ROBOT.torque_limit))
-    leaky = torques(ideal()._replace(linkage=np.array(0.5)), np.full((1, 10), 4.0))[0]
+    linked, limit = ideal()._replace(linkage=np.array(0.5)), ROBOT.torque_limit
+    for plant in (ideal(), linked):  # of the sum, as MuJoCo's actuators limit it
+        most = torques(plant, np.outer([1.0, -1.0], np.full(10, 1e3)))
+        np.testing.assert_allclose(most, np.outer([1.0, -1.0], limit))
+        np.testing.assert_array_equal(build_world(plant).model.actuator_ctrlrange[:, 1], limit)
+    leaky = torques(linked, np.full((1, 10), 4.0))[0]
     np.testing.assert_allclose(leaky, [4.0, 4.0, 4.0, 6.0, 4.0] * 2)
 
 
