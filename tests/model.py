@@ -73,6 +73,4 @@ def random_weights(seed, about=expert, factor=3.0):
 
 def mean_of(objectives, losses=None):
     """The mean of objectives, see `mean_objective`."""
-    return mean_objective(
-        lambda weights: [objective.slope(weights) for objective in objectives], losses
-    )
+    return mean_objective(lambda weights: [one.slope(weights) for one in objectives], losses)

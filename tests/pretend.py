@@ -1,6 +1,8 @@
-"""A console in this process; walks and scores that no simulator made, for what is only drawn."""
+"""A console, here or in a process; walks and scores of no simulator, for what is only drawn."""
 
+import os
 import pickle
+import subprocess
 import sys
 from concurrent.futures import Executor, Future
 from unittest import mock
@@ -28,6 +30,21 @@ def instead(patch, module, name, fake):
     made = mock.create_autospec(getattr(present, "real", present), side_effect=fake)
     made.real = getattr(present, "real", present)  # which has the signature, should it come again
     patch.setattr(module, name, made)
+
+
+# the environment without the flags of the tests
+USUAL = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+
+
+def python(*words, **options):
+    """A process of this Python that has ended."""
+    return subprocess.run([sys.executable, *words], capture_output=True, text=True, **options)
+
+
+def files(folder):
+    """All files of a folder but its lock, and what is in them."""
+    paths = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
 def call(monkeypatch, *words):
@@ -71,12 +88,8 @@ def pretend_walk(seed=0, error=0.03, seconds=4.0, period=0.01, fall_at=None, tur
     step = 2 * np.pi * t / 0.4
     along = period * np.cumsum(0.5 * np.stack([np.cos(yaw), np.sin(yaw), 0 * t], axis=1), axis=0)
     zero = np.zeros((count, 3))
-    reference = State(
-        np.stack([0 * t, 0 * t, yaw], axis=1),
-        along + [0, 0, 0.5],
-        zero,
-        np.gradient(along, t, axis=0),
-    )
+    euler, velocity = np.stack([0 * t, 0 * t, yaw], axis=1), np.gradient(along, t, axis=0)
+    reference = State(euler, along + [0, 0, 0.5], zero, velocity)
     slow = rng.normal(size=(2, 3)) * error
     sway = np.stack([np.sin(2 * step), np.sin(step), np.cos(2 * step)], axis=1)
     state = State(

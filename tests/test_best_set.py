@@ -33,9 +33,7 @@ def masses(plants):
         ((3, 24), 2, 3, 24),
     ],
 )
-def test_a_budget_of_walks_is_of_four_sets_on_twelve_plants_or_of_eight_on_more(
-    given, commands, plants, walks
-):
+def test_a_budget_is_four_sets_on_twelve_plants_or_eight_on_more(given, commands, plants, walks):
     found, budget = best_set.walk_plants(ROBOT, *given, commands)
     assert (len(found), budget) == (plants, walks)
     if given[0] == 0:

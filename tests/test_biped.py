@@ -82,9 +82,7 @@ def test_strider_walks_five_metres_untuned(strider):
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_strider_is_tuned_by_the_same_command_and_a_run_knows_its_robot(
-    monkeypatch, strider, tmp_path
-):
+def test_strider_is_tuned_by_the_same_command_and_a_run_knows_it(monkeypatch, strider, tmp_path):
     monkeypatch.chdir(tmp_path)
     small = CollectConfig(walks=6, seconds=1.0)
     monkeypatch.setattr(nets, "CollectConfig", lambda: small)

@@ -154,9 +154,8 @@ def test_a_floor_that_turns_slippery_is_walked_with_less_friction():
 
     assert use(felt) < use(not_felt)
     # two programs, which may round otherwise
-    np.testing.assert_allclose(
-        felt.command.force[:1000], not_felt.command.force[:1000], rtol=1e-9, atol=1e-9
-    )
+    forces = (each.command.force[:1000] for each in (felt, not_felt))
+    np.testing.assert_allclose(*forces, rtol=1e-9, atol=1e-9)
 
 
 # Another model of the robot as the plant: the controller keeps its own numbers
@@ -195,10 +194,8 @@ def test_both_engines_walk_the_plant_alike():
 @pytest.mark.parametrize("engine", [walk, lambda *known: walk_batch(*known[:2], [known[2]])])
 def test_a_plant_of_other_joints_is_refused(engine):
     job = Job(expert(), named_command("straight"), ideal(), 0.1, plant=load_robot(STRIDER))
-    message = (
-        "robot.toml: joints are left_yaw, .* as a plant of .*hector.toml expected left_hip_yaw"
-    )
-    with pytest.raises(InputError, match=message):
+    told = "robot.toml: joints are left_yaw, .* as a plant of .*hector.toml expected left_hip_yaw"
+    with pytest.raises(InputError, match=told):
         engine(CONFIG, ROBOT, job)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from model import BEST_OTHERS, EXAMPLES, ROBOT, small_net
-from pretend import call, instead, refused
+from pretend import call, files, instead, python, refused
 from synthetic import synthetic_walk
 
 from hector_jax.cli import arguments, doctor
@@ -28,8 +28,7 @@ from hector_jax.store.nets import CollectConfig, TrainedNet
 
 
 def test_help_opens_with_what_is_typed_first_and_names_each_command_once():
-    words = [sys.executable, "-m", "hector_jax"]
-    shown = subprocess.run(words, capture_output=True, text=True)
+    shown = python("-m", "hector_jax")
     assert (shown.returncode, shown.stderr) == (0, "")
     rows = re.findall(r"^  (\w+(?: \w+)?) +\S", shown.stdout, re.MULTILINE)
     assert rows[:6] == ["tune", "view", "export", "robot", "walk", "evaluate"]
@@ -38,13 +37,19 @@ def test_help_opens_with_what_is_typed_first_and_names_each_command_once():
     assert "hector tune --traj straight" in shown.stdout.splitlines()[2]
 
 
-@pytest.mark.parametrize("words", [["log"], ["log", "--help"], ["-h", "steps"]])
-def test_a_first_word_of_two_shows_the_commands_that_begin_with_it(monkeypatch, capsys, words):
+def helped(monkeypatch, capsys, *words):
+    """What is printed by a line that asks for help."""
     with pytest.raises(SystemExit) as left:
         call(monkeypatch, *words)
     assert left.value.code == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [["log"], ["log", "--help"], ["-h", "steps"]])
+def test_a_first_word_of_two_shows_the_commands_that_begin_with_it(monkeypatch, capsys, words):
     (top,) = {"log", "steps"} & {*words}
-    rows = re.findall(r"^  (\w+ \w+) +\S", capsys.readouterr().out, re.MULTILINE)
+    shown = helped(monkeypatch, capsys, *words)
+    rows = re.findall(r"^  (\w+ \w+) +\S", shown, re.MULTILINE)
     assert rows == [name for name in rows if name.startswith(f"{top} ")]
     assert len(rows) == 3
 
@@ -67,10 +72,7 @@ def test_an_unknown_command_is_told_with_the_nearest(monkeypatch, capsys, line, 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_help_tells_each_flag_and_gives_an_example(monkeypatch, capsys, name):
     monkeypatch.setenv("COLUMNS", "200")
-    with pytest.raises(SystemExit) as left:
-        call(monkeypatch, *name.split(), "--help-all")
-    assert left.value.code == 0
-    shown = capsys.readouterr().out
+    shown = helped(monkeypatch, capsys, *name.split(), "--help-all")
     assert f"Example: hector {name}" in shown
     assert "None" not in shown
     assert not re.search(r"^.*--[\w-]+( \S+)?  +\(default", shown, re.MULTILINE)
@@ -78,10 +80,7 @@ def test_every_help_tells_each_flag_and_gives_an_example(monkeypatch, capsys, na
 
 def test_the_help_of_tune_fits_on_a_screen_and_says_where_the_rest_is(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "80")
-    with pytest.raises(SystemExit) as left:
-        call(monkeypatch, "tune", "--help")
-    assert left.value.code == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = helped(monkeypatch, capsys, "tune", "--help").splitlines()
     told = [flag[1] for line in lines if (flag := re.match(r"  --([\w-]+)", line))]
     assert sorted(told) == sorted(Tune.usual)
     assert lines[-1] == f"{len(fields(Tune)) - len(told)} more flags: hector tune --help-all"
@@ -175,13 +174,11 @@ def named(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("line", "fault"), REFUSED)
-def test_wrong_input_is_one_line_before_anything_is_computed(
-    monkeypatch, capsys, named, line, fault
-):
+def test_wrong_input_is_one_line_before_anything_is_made(monkeypatch, capsys, named, line, fault):
     monkeypatch.chdir(named)
-    before = {path for path in named.rglob("*") if path.name != ".lock"}
+    before = files(named)
     assert fault in refused(monkeypatch, capsys, *line.split())
-    assert {path for path in named.rglob("*") if path.name != ".lock"} == before
+    assert files(named) == before
 
 
 def test_a_step_with_settings_of_its_own_leaves_what_a_tuning_reads(monkeypatch, tmp_path):
@@ -202,9 +199,7 @@ def test_a_step_with_settings_of_its_own_leaves_what_a_tuning_reads(monkeypatch,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["c", "mjx"])
-def test_walks_are_collected_on_either_engine_and_a_net_is_trained_on_them(
-    monkeypatch, capsys, tmp_path, engine
-):
+def test_a_net_is_trained_on_walks_of_either_engine(monkeypatch, capsys, tmp_path, engine):
     monkeypatch.setattr(nets, "tuning_paths", lambda *args: [])
     walks, flags = tmp_path / "walks", ("steps", "collect", "--walks", "5", "--seconds", "0.1")
     assert call(monkeypatch, *flags, "--engine", engine, "--out", walks) == 0

@@ -32,9 +32,8 @@ from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 NAMES = direction_names()
 OTHERS = ("turn_lead", "footstep_feedback", "horizontal_gain", "yaw_gain")
 # past a switch of stance, with what is not believed of the world
-CONFIG = TuneConfig(
-    RolloutConfig(ticks=24, lead=10, estimate_noise=0.5, delay=0.004), others=OTHERS
-)
+BLIND = RolloutConfig(ticks=24, lead=10, estimate_noise=0.5, delay=0.004)
+CONFIG = TuneConfig(BLIND, others=OTHERS)
 COMMANDS = ("c", "s")
 START = expert()._replace(
     others={"turn_lead": 0.6, "footstep_feedback": 0.1, "horizontal_gain": 3.0, "yaw_gain": 40.0}

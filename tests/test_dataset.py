@@ -182,9 +182,8 @@ def test_a_collection_of_something_else_is_not_overwritten(tmp_path):
 
 def test_the_legs_get_what_the_wrench_does_not_explain(three, data):
     row, walk, j = np.flatnonzero((data.walk == 1) & (data.tick == 7))[0], 1, 7
-    before, after = (
-        jax.tree.map(lambda s, t=t: jnp.asarray(s[walk, t]), three.state) for t in (j - 1, j)
-    )
+    at = lambda t: jax.tree.map(lambda s: jnp.asarray(s[walk, t]), three.state)  # noqa: E731
+    before, after = at(j - 1), at(j)
     wrench = jax.tree.map(lambda w: jnp.asarray(w[walk, j]), three.effect)
     feet = jnp.asarray(three.feet[walk, j - 1 : j + 1].mean(axis=0))
     push = srbm.unexplained(ROBOT, before, after, wrench, feet, dt=0.01)

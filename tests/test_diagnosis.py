@@ -137,9 +137,8 @@ def test_hector_walk_tells_the_fall_and_prints_no_nan(monkeypatch, weak, capsys)
     words = ["walk", "--weights", "weak.json", "--seconds", "0.1"]
     assert call(monkeypatch, *words) == 0
     out = capsys.readouterr().out
-    assert re.search(
-        r": fell at -\d.\d+ s, in the start-up: centre of mass .*likeliest cause: ", out
-    )
+    said = r": fell at -\d.\d+ s, in the start-up: centre of mass .*likeliest cause: "
+    assert re.search(said, out)
     assert "nan" not in out
     assert call(monkeypatch, *words, "--json") == 0
     told = json.loads(capsys.readouterr().out)

@@ -31,9 +31,8 @@ def random_tree(seed, scale=1.0):
 def evaluation(loss=1.0, gradient=None, fallen=0.0):
     gradient = random_tree(0) if gradient is None else gradient
     loss, fallen, residual = (np.asarray(x, float) for x in (loss, fallen, 1e-12))
-    return Evaluation(
-        loss, dict.fromkeys(("L_Eul", "L_pos", "L_ctrl"), loss), gradient, fallen, residual
-    )
+    terms = dict.fromkeys(("L_Eul", "L_pos", "L_ctrl"), loss)
+    return Evaluation(loss, terms, gradient, fallen, residual)
 
 
 def stepped_once(gradient, config, start=None):
@@ -142,9 +141,8 @@ def test_it_stops_where_the_next_step_is_predicted_to_gain_too_little(share, end
     """Of the whole loss, of which no weight changes the largest part."""
     start = vector_to_weights(jnp.asarray(OPTIMUM * 1.1))
     gain = 1e6 * 24 * np.log(1.1) ** 2
-    found = tune_toy(
-        quadratic(fixed=gain * (1.0 / (share * TuneConfig().least_gain) - 1.0)), start=start
-    )
+    fixed = gain * (1.0 / (share * TuneConfig().least_gain) - 1.0)
+    found = tune_toy(quadratic(fixed), start=start)
     assert (len(found.iterations) == 1) == ended
     assert Stop(int(found.stop)) == Stop.NO_GAIN
     assert found.reason.endswith("predicted to gain too little")
@@ -189,10 +187,7 @@ def test_after_a_fall_a_shorter_step_leaves_from_the_last_accepted_weights():
 
 
 def test_a_step_that_gains_less_than_a_hundredth_of_the_prediction_is_refused():
-    level = quadratic()._replace(
-        slope=lambda weights: (evaluation(1.0, random_tree(1)), jnp.eye(18))
-    )
-    found = tune_toy(level)
+    found = tune_toy(Objective(lambda weights: (evaluation(1.0, random_tree(1)), jnp.eye(18))))
     assert [i.accepted for i in found.iterations] == [True, False, False, False]
     assert found.iterations[-1].reason == "the loss did not fall as predicted"
     assert Stop(int(found.stop)) == Stop.SMALL_STEP
@@ -233,11 +228,8 @@ def test_ten_iterations_go_below_a_hundred_of_the_papers():
 def test_other_numbers_step_by_a_share_of_their_box_and_what_is_not_tuned_stays():
     config = TuneConfig(rule="relative", others=("turn_lead", "footstep_feedback"))
     start = nominal()._replace(others={"friction": 0.4})
-    assert {name: float(x) for name, x in init(config, start).start.others.items()} == {
-        "footstep_feedback": 0.12,
-        "friction": 0.4,
-        "turn_lead": 0.5,
-    }
+    begun = {name: float(x) for name, x in init(config, start).start.others.items()}
+    assert begun == {"footstep_feedback": 0.12, "friction": 0.4, "turn_lead": 0.5}
     slopes = {"footstep_feedback": jnp.array(4.0), "friction": 1e9, "turn_lead": jnp.array(-2.0)}
     gradient = random_tree(1)._replace(others=jax.tree.map(jnp.asarray, slopes))
     moved = stepped_once(gradient, config, start)

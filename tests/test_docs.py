@@ -12,8 +12,6 @@ import pkgutil
 import re
 import runpy
 import shlex
-import subprocess
-import sys
 import tomllib
 from dataclasses import fields
 from pathlib import Path
@@ -23,6 +21,7 @@ import jax
 import numpy as np
 import pytest
 from delay import AS_PROPOSED, BEFORE
+from pretend import python
 
 from hector_jax.cli import flags, parse
 from hector_jax.control.controller import walk_config
@@ -119,16 +118,8 @@ def test_commands_of_a_page_parse_and_what_it_names_is_there(path, capsys):
 # Flags, sections, files and names, wherever they are told
 
 PACKAGE = ROOT / "hector_jax"
-FOREIGN = {
-    "help",
-    "help-all",
-    "tyro-print-completion",
-    "no-NAME",
-    "nworkers",
-    "nthreads",
-    "inplace",
-    "xla",
-}
+FOREIGN = {"help", "help-all", "no-NAME", "tyro-print-completion"}
+FOREIGN |= {"nworkers", "nthreads", "inplace", "xla"}
 TABLES = {"feet", "joints", "limits", "loss", "plants", "slip", "tuning", "twin", "weights"}
 TABLES |= {"footstep", "gait", "legs", "mpc"}  # of a robot's file
 MEANS = {"footstep": "FootstepConfig", "gait": "GaitConfig", "legs": "LegConfig"}
@@ -519,9 +510,8 @@ def published_robots():
     yield README, "On S G1, T1 and Adam Lite fall anyway."
     three = {traj: one["sets"] for traj, one in report("robots/robots.json")["three"]["t1"].items()}
     falls = [three["s"][name]["standin"]["falls"] for name in NAMES]
-    changes = [
-        three[x]["best"]["standin"]["change"]["nominal"]["median"] for x in ("straight", "c")
-    ]
+    best_of = (three[x]["best"]["standin"] for x in ("straight", "c"))
+    changes = [one["change"]["nominal"]["median"] for one in best_of]
     assert falls[0] > falls[1]  # it does not help
     text = "T1 falls {} times of 8 on S (`nominal` {}), with {:.0f} % on straight and {:.0f} % on c"
     yield RESULTS, text.format(*falls, *changes)
@@ -640,8 +630,7 @@ def test_each_number_of_readme_results_and_limits_is_that_of_its_file():
 
 @pytest.mark.slow
 def test_the_site_is_built_without_a_warning_and_asks_nobody_for_anything(tmp_path):
-    build = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", DOCS, tmp_path / "site"]
-    done = subprocess.run(build, capture_output=True, text=True)
+    done = python("-m", "sphinx", "-W", "--keep-going", "-q", DOCS, tmp_path / "site")
     assert done.returncode == 0, done.stderr
     outside = re.compile(r"<(?:script|link|img|iframe)[^>]+(?:src|href)=\"(?:https?:)?//", re.I)
     for path in (tmp_path / "site").rglob("*.html"):
@@ -670,9 +659,7 @@ def test_notebooks_run_to_their_end(name, tmp_path):
 def test_the_example_tunes_in_25_lines_and_walks_better():
     example = ROOT / "examples" / "tune.py"
     assert len(example.read_text().splitlines()) <= 25
-    shown = subprocess.run(
-        [sys.executable, example], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout
+    shown = python(example, cwd=ROOT, check=True).stdout
     row = r"^(\w+): ([\d.]+) cm off, ([\d.]+) degrees in pitch, fell: False$"
     rows = re.findall(row, shown, re.MULTILINE)
     assert [name for name, *_ in rows] == ["plain", "tuned"]

@@ -1,6 +1,5 @@
 """Whatever the environment is, a program works, or one line says what of it is wrong."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -8,11 +7,9 @@ import time
 from unittest import mock
 
 import pytest
+from pretend import USUAL, python
 
 from hector_jax.core.console import exit_code
-
-# without the flags of the tests
-USUAL = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
 
 
 @pytest.mark.parametrize(
@@ -25,12 +22,7 @@ USUAL = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS
 )
 def test_what_does_not_work_with_the_environment_is_one_line(wrong, words, told):
     name, value = wrong.split("=")
-    done = subprocess.run(
-        [sys.executable, "-m", "hector_jax.cli.main", *words.split()],
-        env=USUAL | {name: value},
-        capture_output=True,
-        text=True,
-    )
+    done = python("-m", "hector_jax.cli.main", *words.split(), env=USUAL | {name: value})
     assert (done.returncode, done.stdout) == (2, "")
     (said,) = [text for text in done.stderr.splitlines() if text != "loading JAX and MuJoCo"]
     assert said.startswith(f"hector: {told}")
@@ -83,9 +75,8 @@ sys.exit(console.exit_code("toy", work))
 
 
 def test_a_signal_ends_a_program_that_hangs_in_compiled_code():
-    toy = subprocess.Popen(
-        [sys.executable, "-c", DEAF], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    toy = subprocess.Popen([sys.executable, "-c", DEAF], text=True, **pipes)
     assert toy.stdout.readline() == "deaf\n"
     time.sleep(0.3)  # until it is
     start = time.monotonic()

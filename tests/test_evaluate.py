@@ -146,9 +146,7 @@ def walked(monkeypatch):
     return state
 
 
-def test_all_engines_and_models_walk_and_a_cut_evaluation_goes_on(
-    monkeypatch, tmp_path, capsys, walked
-):
+def test_all_engines_and_models_walk_and_a_cut_one_goes_on(monkeypatch, tmp_path, capsys, walked):
     words = ("evaluate", "--out", tmp_path, "--traj", "s", "--seeds", 2, "--other-seeds", 1)
     words += ("--engine", "all", "--plant", "light", "heavy", "--json")
     walked.cut = 9
@@ -168,9 +166,7 @@ def test_all_engines_and_models_walk_and_a_cut_evaluation_goes_on(
     assert len(walked.jobs) == 14
 
 
-def test_a_folder_has_a_file_for_each_trajectory_and_a_world_other_plants(
-    monkeypatch, tmp_path, capsys, walked
-):
+def test_a_folder_has_a_file_for_each_trajectory(monkeypatch, tmp_path, capsys, walked):
     for name, weights in (("s", expert()), ("c", nominal())):
         save_weights(tmp_path / "sets" / f"{name}.json", weights)
     words = "--weights", "nominal", f"mine={tmp_path / 'sets'}", "--world", "standin-even", "--json"

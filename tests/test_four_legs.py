@@ -41,9 +41,8 @@ def test_an_anchor_may_be_anywhere_on_its_axis(tmp_path, ahead):
     """Also where the anchors of the hind legs are ahead of those of the front legs."""
 
     def proposed(roll, pitch):
-        changes = [
-            (rf'(<joint name="{end}_\w+_roll")', rf'\1 pos="{x} 0 0"') for end, x in roll.items()
-        ]
+        hips = ((rf'(<joint name="{end}_\w+_roll")', x) for end, x in roll.items())
+        changes = [(hip, rf'\1 pos="{x} 0 0"') for hip, x in hips]
         for side, x in (("left", ahead), ("right", -ahead)):
             pose = f'axis="{x} 0.95 0" pos="{x * pitch} {0.95 * pitch} 0"'
             changes.append((rf'(<joint name="\w+_{side}_pitch")', rf"\1 {pose}"))

@@ -94,9 +94,8 @@ def test_with_the_weights_of_a_log_the_planned_commands_are_those_of_the_log(noi
     seconds = BRIEF.ticks * config.gait.tick
     walked = walk(config, ROBOT, Job(weights, command, plant, seconds, seed=3))
     stride = round(config.gait.tick / float(walked.period))
-    log = jax.tree.map(
-        lambda x: x[stride - 1 :: stride], walked._replace(period=None, initial=None)
-    )
+    rows = walked._replace(period=None, initial=None)
+    log = jax.tree.map(lambda x: x[stride - 1 :: stride], rows)
     log = log._replace(period=np.array(config.gait.tick), initial=walked.initial)
     assert np.abs(log.belief.disturbance.linear).max() > 0.1
     assert np.any(log.belief.state.position) == noise

@@ -101,9 +101,7 @@ def test_corner_friction_is_what_the_corners_hold_within_their_squares(yaw):
     side = 0.5 * MU / max(abs(np.cos(yaw)), abs(np.sin(yaw)))
     foot = np.array([(side * a, side * b, 1.0) for a, b in product((1, -1), (1, -1))])
     forces = foot @ Rotation.from_euler("z", yaw).as_matrix().T
-    edges = np.concatenate(
-        [corner_forces(yaw)[:, 3 * i : 3 * i + 3] @ forces.T for i in range(4)], 1
-    )
+    edges = np.hstack([corner_forces(yaw)[:, 3 * i : 3 * i + 3] @ forces.T for i in range(4)])
     A, lower, upper = rows_of(yaw, [CORNER_FRICTION])
     room = np.minimum(A @ edges - lower[:, None], upper[:, None] - A @ edges)
     np.testing.assert_allclose(room.min(axis=1), 0.0, atol=1e-12)

@@ -214,9 +214,7 @@ def test_a_draft_has_what_was_found_and_what_is_to_be_mended(monkeypatch, capsys
     assert tomllib.loads(printed[printed.index("# Proposed") :])["model"] == "arm.xml"
 
 
-def test_what_a_hand_written_file_leaves_out_is_filled_in_by_the_rules(
-    monkeypatch, capsys, tmp_path
-):
+def test_what_a_file_by_hand_leaves_out_is_filled_in_by_the_rules(monkeypatch, capsys, tmp_path):
     model = edited(tmp_path)
     full = propose_robot(model).table
     path = tmp_path / "own.toml"

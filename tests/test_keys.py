@@ -84,9 +84,8 @@ def test_a_number_of_the_user_that_is_tuned_is_in_the_keys(monkeypatch):
 
     def keys(**changed):
         monkeypatch.setitem(TUNABLES, "mine", mine._replace(**changed))
-        return {
-            *map(key, (replace(CONFIG, others=("mine",)), weights, JOB._replace(weights=weights)))
-        }
+        tuned = replace(CONFIG, others=("mine",))
+        return {*map(key, (tuned, weights, JOB._replace(weights=weights)))}
 
     assert keys() == keys()
     each = keys(), keys(path="mpc.friction"), keys(lower=0.1), keys(upper=900.0)

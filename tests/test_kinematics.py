@@ -80,9 +80,7 @@ def written(folder, count):
     names = {s: [f"{s}{i}" for i in range(count)] for s in ("left", "right")}
     lines += ["[joints]", *(f"{side} = {joints!r}" for side, joints in names.items())]
     for side, R in zip(("left", "right"), soles, strict=True):
-        corners = [
-            (R.T @ np.array([x, y, -0.05])).tolist() for x in (-0.06, 0.1) for y in (-0.03, 0.03)
-        ]
+        corners = [(R.T @ (x, y, -0.05)).tolist() for x in (-0.06, 0.1) for y in (-0.03, 0.03)]
         point = (R.T @ np.array([0.0, 0.0, -0.05])).tolist()
         lines += [f"[feet.{side}]", f'body = "{side}{count - 1}"']
         lines += [f"contacts = {corners}", f"point = {point}"]

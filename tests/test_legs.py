@@ -45,15 +45,9 @@ targets = jax.jit(
 
 
 @partial(jax.jit, static_argnums=0)
-def torques(config, state, joints, rates, contact, wrench, target, target_rates):
-    return joint_torques(
-        ROBOT,
-        config.parameters,
-        Measurement(state, joints, rates),
-        contact=contact,
-        wrench=wrench,
-        target=(target, target_rates),
-    )
+def torques(config, measurement, contact, wrench, target):
+    now = {"contact": contact, "wrench": wrench, "target": target}
+    return joint_torques(ROBOT, config.parameters, measurement, **now)
 
 
 poses = jax.jit(lambda joints: foot_poses(ROBOT, joints))
@@ -197,19 +191,9 @@ def test_stance_legs_push_and_swing_legs_follow_and_carry_their_weight():
     """A stance leg carries its own on request."""
     state, joints, rates = base((0.1, 0.2, 0.3)), STANDS + 0.1, jnp.linspace(-0.5, 0.5, 10)
     wrench = Wrench(jnp.array([[1.0, 2.0, 0.8 * WEIGHT], [0.0, 0.0, 0.0]]), jnp.zeros((2, 3)))
-    loaded, plain = (
-        torques(
-            LegConfig(gravity_compensation=own),
-            state,
-            joints,
-            rates,
-            jnp.array([True, False]),
-            wrench,
-            joints + 0.05,
-            jnp.full(10, 0.2),
-        )
-        for own in (True, False)
-    )
+    measurement, target = Measurement(state, joints, rates), (joints + 0.05, jnp.full(10, 0.2))
+    stands, configs = jnp.array([True, False]), (LegConfig(gravity_compensation=True), CONFIG)
+    loaded, plain = (torques(one, measurement, stands, wrench, target) for one in configs)
     weight = carried(joints, jnp.asarray(ROBOT.gravity) @ rotation_from_euler(state.euler))
     pushed = stance(state, joints, wrench)[:5]
     np.testing.assert_allclose(plain[:5], pushed, atol=1e-9)
@@ -220,12 +204,11 @@ def test_stance_legs_push_and_swing_legs_follow_and_carry_their_weight():
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_torques_stay_within_their_limits(sign):
-    still = jnp.zeros(10)
+    at_rest = Measurement(base(), STANDS, jnp.zeros(10))
+    huge = Wrench(jnp.full((2, 3), 1e5 * sign), jnp.zeros((2, 3)))
+    far = STANDS + 9.0 * sign, jnp.zeros(10)
     for stands in (True, False):
-        huge = Wrench(jnp.full((2, 3), 1e5 * sign), jnp.zeros((2, 3)))
-        found = torques(
-            CONFIG, base(), STANDS, still, jnp.full(2, stands), huge, STANDS + 9.0 * sign, still
-        )
+        found = torques(CONFIG, at_rest, jnp.full(2, stands), huge, far)
         assert (np.abs(found) <= ROBOT.torque_limit).all()
         assert (np.abs(found) == ROBOT.torque_limit).any()
     np.testing.assert_array_equal(found, sign * ROBOT.torque_limit)

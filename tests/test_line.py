@@ -1,38 +1,35 @@
 """The command line: its words become flags, or one line says which word is wrong."""
 
 import os
-import subprocess
-import sys
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import get_args
 
 import pytest
-from pretend import refused
+from pretend import python, refused
 
 from hector_jax.cli.flags import COMMANDS, Evaluate, Export, Tune, View, Walk, named_file
 from hector_jax.cli.parse import check_flags, from_line, resolve_latest
 from hector_jax.core.files import write_json
 
+EVALUATED = Evaluate(weights=("nominal", "a.json"), first_seed=3, json=True)
+A, B = Path("a"), Path("b")
 
-def test_flags_are_taken_in_any_order_and_spelling():
-    expected = Evaluate(weights=("nominal", "a.json"), first_seed=3, json=True)
-    for words in (
-        "evaluate --weights nominal a.json --first-seed 3 --json",
-        "evaluate --json --first_seed=3 --weights nominal a.json",
-    ):
-        assert from_line(words.split()) == expected
-    assert from_line(["tune", "--no-video"]) == Tune(video=False)
-    assert from_line("view runs/a --sets a b --seconds 2".split()) == View(
-        Path("runs/a"), sets=("a", "b"), seconds=2.0
-    )
-    assert from_line("export --set without runs/a --json".split()) == Export(
-        Path("runs/a"), set="without", json=True
-    )
-    assert from_line("evaluate --json --runs a b".split()) == Evaluate(
-        runs=(Path("a"), Path("b")), json=True
-    )
-    assert from_line(["walk", "--out=-dash.npz"]) == Walk(out=Path("-dash.npz"))
+
+@pytest.mark.parametrize(
+    ("line", "flags"),
+    [
+        ("evaluate --weights nominal a.json --first-seed 3 --json", EVALUATED),
+        ("evaluate --json --first_seed=3 --weights nominal a.json", EVALUATED),
+        ("evaluate --json --runs a b", Evaluate(runs=(A, B), json=True)),
+        ("tune --no-video", Tune(video=False)),
+        ("view a --sets a b --seconds 2", View(A, sets=("a", "b"), seconds=2.0)),
+        ("export --set without a --json", Export(A, set="without", json=True)),
+        ("walk --out=-dash.npz", Walk(out=Path("-dash.npz"))),
+    ],
+)
+def test_flags_are_taken_in_any_order_and_spelling(line, flags):
+    assert from_line(line.split()) == flags
 
 
 @pytest.mark.parametrize(
@@ -87,17 +84,10 @@ def test_every_number_has_an_upper_bound_that_is_told(monkeypatch, capsys, comma
 @pytest.mark.parametrize(
     ("words", "name"), [(["walk", "--weights"], "own.json"), (["log", "add", "runs"], "own.npz")]
 )
-def test_a_file_that_cannot_be_read_is_told_before_anything_is_loaded(
-    tmp_path, make, fault, words, name
-):
+def test_an_unreadable_file_is_told_before_anything_is_loaded(tmp_path, make, fault, words, name):
     make(tmp_path / name)
-    code = (
-        "import sys; from hector_jax.cli.main import main; code = main(); "
-        "print(code, 'jax' in sys.modules)"
-    )
-    shown = subprocess.run(
-        [sys.executable, "-c", code, *words, tmp_path / name], capture_output=True, text=True
-    )
+    code = "import sys; from hector_jax.cli.main import main; print(main(), 'jax' in sys.modules)"
+    shown = python("-c", code, *words, tmp_path / name)
     assert shown.stdout == "2 False\n"
     assert shown.stderr == f"hector: {tmp_path / name}: cannot read the file: {fault}\n"
 
@@ -105,9 +95,7 @@ def test_a_file_that_cannot_be_read_is_told_before_anything_is_loaded(
 @pytest.mark.parametrize(
     "words", ["tune --data", "evaluate --out", "steps grfm --out", "steps collect --out"]
 )
-def test_a_folder_that_cannot_be_one_is_told_before_anything_is_made(
-    monkeypatch, capsys, tmp_path, words
-):
+def test_what_is_no_folder_is_told_before_anything_is_made(monkeypatch, capsys, tmp_path, words):
     monkeypatch.chdir(tmp_path)
     Path("file").write_text("")
     for name in ("/dev/null", "file", "file/below"):
@@ -181,9 +169,7 @@ def test_no_name_makes_a_message_or_a_result_unprintable(tmp_path, encoding):
     program = "import sys; from hector_jax.core import console, runtime\n"
     program += "sys.exit(console.exit_code('toy', lambda: print(runtime.cache_folder())))"
     for words in (["-c", program], ["-m", "hector_jax.cli.main", b"w\xe9lk"]):
-        done = subprocess.run(
-            [sys.executable, *words], cwd=odd, env=environment, capture_output=True, text=True
-        )
+        done = python(*words, cwd=odd, env=environment)
         assert "Traceback" not in done.stderr
         assert done.returncode == 2
         assert (done.stdout + done.stderr).count("\n") == 1

@@ -20,10 +20,8 @@ def _judge(scenes=("s",), **losses):
 
 def test_rms_errors_are_per_axis_and_a_fall_is_charged_but_not_in_them():
     walk, offset = pretend_walk(), np.array([0.01, 0.02, 0.03])
-    shifted = walk._replace(
-        state=walk.reference._replace(position=walk.reference.position + offset)
-    )
-    one = metrics.score(PAPER_LOSS, shifted)
+    beside = walk.reference._replace(position=walk.reference.position + offset)
+    one = metrics.score(PAPER_LOSS, walk._replace(state=beside))
     np.testing.assert_allclose(one.rms_position, offset, rtol=1e-12)
     np.testing.assert_allclose(one.rms_euler, 0.0)
     upright, fell = (metrics.score(PAPER_LOSS, pretend_walk(fall_at=t)) for t in (None, 2.0))
@@ -57,9 +55,8 @@ def test_fewer_than_six_plants_have_no_interval():
             assert found.value == (count + 1) / 2
             assert np.isnan([found.low, found.high]).all()
     verdict = _judge(nominal=[1.0], tuned=[0.5])
-    found = json.loads(as_json(metrics.verdict_result({"standin": verdict})))["sets"]["tuned"][
-        "standin"
-    ]
+    told = json.loads(as_json(metrics.verdict_result({"standin": verdict})))
+    found = told["sets"]["tuned"]["standin"]
     assert found["L"] == {"mean": 0.5, "low": None, "high": None}
     change = found["change"]["nominal"]
     assert (change["median"], change["low"], change["high"]) == (pytest.approx(-50.0), None, None)
@@ -91,9 +88,7 @@ def test_an_interval_over_trajectories_is_one_over_plants():
     [(32, 1, 1, True), (32, 1, 2, False), (8, 1, 1, False), (64, 1, 3, True)]
     + [(8, 3, 1, True), (8, 3, 2, False)],
 )
-def test_a_comparison_counts_only_where_falls_differ_by_less_than_2_of_32_walks(
-    seeds, scenes, fell, counts
-):
+def test_a_comparison_counts_where_falls_differ_by_less_than_2_of_32(seeds, scenes, fell, counts):
     verdict = pretend_verdict(seeds, scenes=("straight", "c", "s")[:scenes])
     fallen = np.arange(seeds * scenes).reshape(seeds, scenes) < fell
     scores = verdict.scores | {"with": verdict.scores["with"]._replace(fallen=fallen)}

@@ -80,23 +80,16 @@ def problem(seed, push=1.0, contact=None, yaw=0.5):
     position[:] = [0.0, 0.0, 0.5]
     position += np.cumsum(velocity, axis=0) * DT
     reference = State(euler, position, spin, velocity)
-    state = State(
-        np.array([0.0, 0.0, yaw]) + off[0],
-        np.array([0.0, 0.0, 0.5]) + off[1],
-        off[2],
-        velocity[0] + off[3],
-    )
+    state = State(*([[0.0, 0.0, yaw], [0.0, 0.0, 0.5], np.zeros(3), velocity[0]] + off))
     side = np.array([[0.0, 0.08, -0.5], [0.0, -0.08, -0.5]])
-    lever = (side + 0.02 * rng.normal(size=(N, 2, 3)) * [1, 1, 0]) @ np.asarray(
-        rot_z(jnp.array(yaw))
-    ).T
+    turn = np.asarray(rot_z(jnp.array(yaw)))
+    lever = (side + 0.02 * rng.normal(size=(N, 2, 3)) * [1, 1, 0]) @ turn.T
     if contact is None:
         left = np.arange(N) < 4
         contact = np.stack([left, ~left], axis=1)
     about = np.stack([0 * heading, 0 * heading, heading - 0.02], axis=1)
-    horizon = Horizon(
-        reference, about, lever, yaw + 0.1 * rng.normal(size=(N, 2)), np.asarray(contact)
-    )
+    foot_yaw = yaw + 0.1 * rng.normal(size=(N, 2))
+    horizon = Horizon(reference, about, lever, foot_yaw, np.asarray(contact))
     return jax.tree.map(jnp.asarray, (state, horizon))
 
 

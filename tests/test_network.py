@@ -71,9 +71,7 @@ def test_the_paper_s_net_has_18_inputs_three_layers_of_64_and_6_outputs(params):
         assert sum(name.startswith("LayerNorm") for name in net) == 3
 
 
-def test_a_drawn_model_goes_through_one_member_and_the_mean_of_all_is_the_ensemble(
-    params, ensemble, window
-):
+def test_a_drawn_model_has_one_member_and_their_mean_is_the_ensemble(params, ensemble, window):
     def used(net, draws=4):
         problem = Problem((named_command("straight"),), net, draws)
         return [scenario.effect for scenario in rollouts_of(TuneConfig(), ROBOT, problem)]

@@ -1,12 +1,10 @@
 """JAX's options: what the environment sets changes no number and breaks no program."""
 
 import json
-import os
-import subprocess
-import sys
 
 import jax
 import pytest
+from pretend import USUAL, python
 
 from hector_jax.cli import doctor
 from hector_jax.core import numerics
@@ -35,14 +33,11 @@ for leaf in jax.tree.leaves((net, draws, reference, lost, ranks)):
 options = {name: repr(value) for name, value in jax.config.values.items()}
 print(json.dumps([content.hexdigest(), numerics.not_used(), options]))
 """
-ENVIRONMENT = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
 
 
 def computed(**variables):
     """The hash of the numbers, the variables that were not used, and JAX's options."""
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM], env=ENVIRONMENT | variables, capture_output=True, text=True
-    )
+    done = python("-c", PROGRAM, env=USUAL | variables)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 

@@ -1,11 +1,11 @@
 """Packages that cannot be loaded, such as those of another Python: one line with their file."""
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from pretend import python
 
 from hector_jax.core.inputs import InputError, outside_packages
 
@@ -28,9 +28,7 @@ def test_a_package_of_another_python_is_named_with_its_file(tmp_path, name):
     file.write_text(COMPILED.format(name=name))
     (file.parent / "_core.cpython-310-x86_64-linux-gnu.so").write_bytes(b"\x7fELF")
     path = os.pathsep.join([f"{tmp_path}/", str(Path(__file__).parents[1])])
-    words = [sys.executable, "-m", "hector_jax.cli.main", "walk"]
-    environment = os.environ | {"PYTHONPATH": path}
-    done = subprocess.run(words, env=environment, capture_output=True, text=True)
+    done = python("-m", "hector_jax.cli.main", "walk", env=os.environ | {"PYTHONPATH": path})
     lines = [line for line in done.stderr.splitlines() if line != "loading JAX and MuJoCo"]
     assert (done.returncode, done.stdout, len(lines)) == (2, "", 1), done.stderr
     assert lines[0].startswith(f"hector: {name} cannot be loaded from {file}: ")

@@ -63,13 +63,11 @@ def test_at_once_with_lead_noise_and_delay():
 def test_a_fall_is_seen_at_the_same_tick():
     # effort so dear that the robot sinks
     weak = vector_to_weights(weights_to_vector(nominal()).at[12:].set(1.0))
-    expected, found = (
-        walked(walk, SHORT, ROBOT, EFFECT, weak)[0] for walk in (rollout, parallel_rollout)
-    )
+    walks = rollout, parallel_rollout
+    expected, found = (walked(walk, SHORT, ROBOT, EFFECT, weak)[0] for walk in walks)
     assert 0 < expected.fallen.sum() < SHORT.ticks
     np.testing.assert_array_equal(found.fallen, expected.fallen)
     assert found.residual.max() < 1e-8
     standing = ~np.asarray(expected.fallen)
-    np.testing.assert_allclose(
-        found.state.position[standing], expected.state.position[standing], atol=1e-9
-    )
+    places = (each.state.position[standing] for each in (found, expected))
+    np.testing.assert_allclose(*places, atol=1e-9)

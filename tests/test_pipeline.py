@@ -33,13 +33,9 @@ ONCE = TrainConfig("linear")  # the command's variant here: its fit takes no tim
 
 def gather(folder, draw=0, **others):
     """Toy walks with the card of those that a command would collect, but for `others`."""
-    collect(
-        folder,
-        draw_jobs(draw, 5),
-        lambda jobs: (synthetic_walk(10 * draw + job.seed, 12) for job in jobs),
-        robot=ROBOT,
-        settings=nets.collection_settings(CollectConfig(), ROBOT) | others,
-    )
+    walk = lambda jobs: (synthetic_walk(10 * draw + job.seed, 12) for job in jobs)  # noqa: E731
+    settings = nets.collection_settings(CollectConfig(), ROBOT) | others
+    collect(folder, draw_jobs(draw, 5), walk, robot=ROBOT, settings=settings)
 
 
 def ground(folder):
@@ -95,9 +91,7 @@ def test_a_net_of_other_settings_or_other_walks_is_refused_and_stays(tmp_path):
         ((1.0,), 3, 0, [1.0, 2.0, 3.0]),  # all fall: the tuning refuses the start
     ],
 )
-def test_several_losses_count_alike_without_drawn_models_with_which_the_start_falls(
-    monkeypatch, capsys, sizes, draws, stand, counted
-):
+def test_losses_count_alike_and_falls_do_not(monkeypatch, capsys, sizes, draws, stand, counted):
     """The loss is the duration of the command, times more for a model of a higher seed."""
 
     def slope(config, scenario, weights):

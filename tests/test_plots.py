@@ -15,9 +15,8 @@ FOUR = ("nominal", "expert", "without", "with")
 
 @pytest.fixture(scope="module")
 def walks():
-    return {
-        name: pretend_walk(i, 0.02 + 0.01 * i, seconds=1.0, turn=0.5) for i, name in enumerate(FOUR)
-    }
+    made = (pretend_walk(i, 0.02 + 0.01 * i, seconds=1.0, turn=0.5) for i in range(4))
+    return dict(zip(FOUR, made, strict=True))
 
 
 def lines(axes):

@@ -82,9 +82,8 @@ def test_a_gait_is_chosen_by_name(monkeypatch, capsys):
 def test_a_foot_of_each_pair_lands_beside_its_own_hips():
     """Two feet of a trot, of either pair and side, land at once: as far apart as they stand."""
     still = jax.tree.map(np.zeros_like, named_command("straight"))._replace(duration=np.ones(2))
-    state = State(
-        *(jnp.asarray(x) + 0.01 for x in (np.zeros(3), ANCHOR.position, *np.zeros((2, 3))))
-    )
+    rows = np.zeros(3), ANCHOR.position, *np.zeros((2, 3))
+    state = State(*(jnp.asarray(row) + 0.01 for row in rows))
     feet = Feet(jnp.asarray(ROBOT.foot_ahead)[:, None] * jnp.eye(3)[0], jnp.zeros(4))
     now = {"anchor": ANCHOR, "tick": jnp.asarray(3), "state": state, "feet": feet}
     plan = jax.jit(partial(plan_horizon, CONFIG, ROBOT, CONFIG.footstep.parameters, command=still))

@@ -38,16 +38,10 @@ TURNS = Command(np.full(2, 2.0), np.array([[0.5, 0.0], [0.2, 0.0]]), np.full(2, 
 )
 def test_the_path_is_the_integral_of_its_velocity(command):
     times = np.arange(0, 13.0, 1e-3)
-    state = path(command, times)
-    middle = path(command, times[:-1] + 5e-4)
-    np.testing.assert_allclose(
-        np.diff(state.position, axis=0), 1e-3 * np.asarray(middle.velocity), atol=2e-8
-    )
-    np.testing.assert_allclose(
-        np.diff(np.asarray(state.euler)[:, 2]),
-        1e-3 * np.asarray(middle.ang_velocity)[:, 2],
-        atol=1e-12,
-    )
+    state, middle = path(command, times), path(command, times[:-1] + 5e-4)
+    moved, turned = np.diff(state.position, axis=0), np.diff(state.euler[:, 2])
+    np.testing.assert_allclose(moved, 1e-3 * middle.velocity, atol=2e-8)
+    np.testing.assert_allclose(turned, 1e-3 * middle.ang_velocity[:, 2], atol=1e-12)
 
 
 @pytest.mark.parametrize(

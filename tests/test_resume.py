@@ -17,8 +17,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from model import ROBOT
-from pretend import call
+from model import ROBOT, ROOT
+from pretend import call, files, python
 
 from hector_jax.cli import flags, run_folder
 from hector_jax.cli import tune as command
@@ -31,7 +31,7 @@ from hector_jax.core.runtime import cache_folder, workers
 from hector_jax.core.tree_file import save_tree
 from hector_jax.store.cache import load_or_make
 
-HERE = Path(__file__).parent
+HERE, OURS = ROOT / "tests", {"PYTHONPATH": str(ROOT)}
 STATE = {"x": np.arange(3.0)}
 
 
@@ -46,11 +46,6 @@ def state(folder, made=None):
     paths = {"a": folder / "state.npz"}
     found = load_or_make(paths, make, like=lambda _: STATE, kind="thing", robot=ROBOT)
     return found["a"]["x"].tolist()
-
-
-def files(folder):
-    paths = (path for path in folder.rglob("*") if path.is_file())
-    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
 @pytest.mark.parametrize(("step", "number"), [("fsync", 0), ("replace", 0), ("fsync", 1)])
@@ -261,15 +256,9 @@ if __name__ == "__main__":
 )
 def test_a_signal_ends_a_program_and_its_workers_in_one_line(tmp_path, signals, codes, line):
     (tmp_path / "program.py").write_text(PROGRAM)
-    program = subprocess.Popen(
-        [sys.executable, "program.py"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(HERE.parent)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    options |= {"cwd": tmp_path, "env": os.environ | OURS, "start_new_session": True}
+    program = subprocess.Popen([sys.executable, "program.py"], **options)
     worker = Path("/proc") / program.stdout.readline().strip()
     for number in signals:
         # an interrupt of the terminal reaches the workers too
@@ -390,14 +379,9 @@ def test_killed_25_times_on_all_cores_it_ends_in_the_bytes_of_an_unbroken_run_on
 
     def run(name, kills, cores):
         (tmp_path / name).mkdir()
-        ran = subprocess.run(
-            [sys.executable, "killed.py", job, tmp_path / name / job, str(kills)],
-            cwd=HERE,
-            env={**os.environ, "PYTHONPATH": str(HERE.parent)},
-            preexec_fn=lambda: os.sched_setaffinity(0, cores),
-            capture_output=True,
-            text=True,
-        )
+        bind = lambda: os.sched_setaffinity(0, cores)  # noqa: E731
+        words = "killed.py", job, tmp_path / name / job, str(kills)
+        ran = python(*words, cwd=HERE, env=os.environ | OURS, preexec_fn=bind)
         assert ran.returncode == 0, ran.stderr
         return int(ran.stdout.split()[1])
 

@@ -29,9 +29,8 @@ def test_standing_trunk_is_at_548_millimetres_with_both_soles_on_the_floor(model
     data = standing_data(Description(), model)
     assert robot.trunk_height == pytest.approx(0.548, abs=1e-3)
     for foot, side in zip([foot.point for foot in Description().named_feet], (1, -1), strict=True):
-        np.testing.assert_allclose(
-            data.site(foot).xpos, [-0.0135, side * 0.0942, 0.0], rtol=0, atol=1e-6
-        )
+        there = [-0.0135, side * 0.0942, 0.0]
+        np.testing.assert_allclose(data.site(foot).xpos, there, rtol=0, atol=1e-6)
     np.testing.assert_allclose(np.rad2deg(robot.standing_joints), [0, 0, 45, -90, 45] * 2)
 
 
@@ -70,12 +69,10 @@ def test_robot_in_the_air_touches_only_leg_against_leg(model, robot):
     assert touched > 0
 
 
-@pytest.mark.parametrize(
-    ("quaternion", "height"), [((0.7, 0.7, 0, 0), 0.08), ((0.7, 0, 0.7, 0), 0.05)]
-)
-def test_lying_robot_touches_the_floor_with_more_than_its_feet(model, quaternion, height):
+@pytest.mark.parametrize(("turn", "height"), [((0.7, 0.7, 0, 0), 0.08), ((0.7, 0, 0.7, 0), 0.05)])
+def test_lying_robot_touches_the_floor_with_more_than_its_feet(model, turn, height):
     data = standing_data(Description(), model)
-    data.qpos[2:7] = [height, *quaternion]
+    data.qpos[2:7] = [height, *turn]
     mujoco.mj_forward(model, data)
     touching = {body for pair in body_pairs(model, data) for body in pair}
     assert "trunk" in touching

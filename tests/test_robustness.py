@@ -2,13 +2,11 @@
 
 import json
 import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 from model import ROOT
-from pretend import pretend_score
+from pretend import pretend_score, python
 from scenes import DIRECTIONS, Level, SceneConfig, evaluate_level, make_scenes, significant
 
 from hector_jax.core.tree import stack
@@ -67,11 +65,11 @@ def test_several_tests_are_corrected_step_by_step():
 
 @pytest.mark.slow
 def test_the_report_is_written_and_walks_are_taken_up_again(tmp_path):
-    script = [sys.executable, ROOT / "experiments/robustness.py", "--out", tmp_path]
+    script = [ROOT / "experiments/robustness.py", "--out", tmp_path]
     flags = "--plants ideal=0-0 --traj straight --forces 50 --frictions 0.4 --phases 1"
     call = [*script, *flags.split(), "--processes", "1"]
-    options = {"env": os.environ | {"PYTHONPATH": str(ROOT)}, "text": True, "check": True}
-    runs = [subprocess.run(call, capture_output=True, **options) for _ in range(2)]
+    options = {"env": os.environ | {"PYTHONPATH": str(ROOT)}, "check": True}
+    runs = [python(*call, **options) for _ in range(2)]
     assert {run.stdout.strip() for run in runs} == {str(tmp_path / "report.md")}
     assert "36 walks" in runs[0].stderr
     assert "walks" not in runs[1].stderr

@@ -229,15 +229,10 @@ def test_the_derivatives_by_other_numbers_are_those_of_differences_and_of_the_re
 @pytest.mark.skipif(jax.default_backend() != "gpu", reason="there is no GPU")
 @pytest.mark.parametrize("walked", [rollout, parallel_rollout])
 def test_gradients_of_64_varied_rollouts_on_a_gpu_are_those_of_the_cpu(walked):
-    scenarios = stack(
-        [
-            STRAIGHT._replace(
-                command=named_command(("straight", "c", "s", "sideways")[seed % 4]),
-                variation=drawn_variation(SHORT.walk, ROBOT, seed),
-            )
-            for seed in range(64)
-        ]
-    )
+    commands = 16 * [named_command(name) for name in ("straight", "c", "s", "sideways")]
+    drawn = (drawn_variation(SHORT.walk, ROBOT, seed) for seed in range(64))
+    pairs = zip(commands, drawn, strict=True)
+    scenarios = stack([STRAIGHT._replace(command=c, variation=v) for c, v in pairs])
     weights = stack(sample_weights(nominal(), 1.5, 64))
     one = partial(evaluate, SHORT, loss=PAPER_LOSS, walk=walked)
     found = {}

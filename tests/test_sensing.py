@@ -99,9 +99,8 @@ def test_base_state_is_that_of_a_point_fixed_to_the_trunk():
     np.testing.assert_allclose(state.position, data.subtree_com[0], atol=1e-4)
     np.testing.assert_allclose(state.position, data.xpos[1] + offset, atol=1e-9)
     np.testing.assert_allclose(state.ang_velocity, velocity[:3], atol=1e-9)
-    np.testing.assert_allclose(
-        state.velocity, velocity[3:] + np.cross(velocity[:3], offset), atol=1e-9
-    )
+    expected = velocity[3:] + np.cross(velocity[:3], offset)
+    np.testing.assert_allclose(state.velocity, expected, atol=1e-9)
 
 
 def test_foot_points_count_the_backlash():
@@ -129,9 +128,7 @@ def test_yaw_goes_on_past_half_a_turn():
     [(0.2, 0.0, True, False), (1.0, 0.0, False, False), (1.0, 0.3, False, True)],
     ids=["knees on the floor", "in the air", "legs crossed"],
 )
-def test_what_touches_is_told_and_only_feet_on_the_floor_have_a_wrench(
-    height, inwards, floor, legs
-):
+def test_what_touches_is_told_and_feet_on_the_floor_have_a_wrench(height, inwards, floor, legs):
     world, data, _ = stand(ideal(), steps=0)
     roll = inwards * np.array([0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
     data.qpos[:] = standing_qpos(world, ROBOT.standing_joints + roll, height)

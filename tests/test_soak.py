@@ -2,8 +2,6 @@
 
 import json
 import os
-import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -11,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 from model import ANCHOR, ROBOT, ROOT, SHORT, small_net
+from pretend import python
 
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import nominal
@@ -79,12 +78,7 @@ def test_memory_arrays_and_open_files_stay_flat_over_500_iterations():
 @pytest.mark.slow
 def test_256_closed_loops_at_once_stay_under_6_gib():
     """With their gradients, in a process of its own."""
-    ran = subprocess.run(
-        [sys.executable, "-m", "benchmarks.closed_loop", "--ticks=400", "--batch=256"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
+    ran = python("-m", "benchmarks.closed_loop", "--ticks=400", "--batch=256", cwd=ROOT)
     assert ran.returncode == 0, ran.stderr
     told = json.loads(ran.stdout.splitlines()[-1])
     assert told["memory"] < 6 * 2**30

@@ -83,10 +83,8 @@ def test_a_urdf_is_the_robot_that_its_numbers_are(tmp_path, world):
     for side in ("left", "right"):
         ours, theirs = model.site(f"{side}_point"), hector.site(f"{side}_foot_point")
         np.testing.assert_allclose(ours.pos, theirs.pos, atol=1e-9)
-    got, expected = standing(model), standing(hector)
-    np.testing.assert_allclose(
-        mass_matrix(model, got), mass_matrix(hector, expected), atol=1e-9, rtol=0
-    )
+    ours, theirs = (mass_matrix(one, standing(one)) for one in (model, hector))
+    np.testing.assert_allclose(ours, theirs, atol=1e-9, rtol=0)
 
 
 TURNED = {  # a body, and a joint that is not zero where the file draws it
@@ -203,9 +201,8 @@ def test_a_mass_beside_the_robot_is_left_out_and_told(tmp_path):
     lamp = '<body name="lamp"><geom size="1" mass="9" contype="0" conaffinity="0"/></body>'
     source = build_spec(small(tmp_path, more=f"<worldbody>{lamp}</worldbody>"))
     assert "left out, which no joint holds: lamp" in source.notes
-    assert source.spec.compile().body_mass.sum() == pytest.approx(
-        compiled(small(tmp_path)).body_mass.sum()
-    )
+    without = compiled(small(tmp_path)).body_mass.sum()
+    assert source.spec.compile().body_mass.sum() == pytest.approx(without)
 
 
 def test_names_are_the_files_own_and_what_has_none_gets_one(tmp_path):

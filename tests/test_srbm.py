@@ -17,16 +17,13 @@ def robot():
 
 def some_state(seed):
     draws = np.random.default_rng(seed).normal(size=(4, 3)) * np.array([[0.2], [0.3], [1.0], [0.5]])
-    return State(*map(jnp.asarray, draws))._replace(
-        position=jnp.asarray(draws[1]) + jnp.array([0, 0, 0.4])
-    )
+    draws[1, 2] += 0.4
+    return State(*map(jnp.asarray, draws))
 
 
 def some_wrench(seed):
     rng = np.random.default_rng(100 + seed)
-    return Wrench(
-        jnp.asarray(rng.normal(size=(2, 3)) * 40), jnp.asarray(rng.normal(size=(2, 3)) * 3)
-    )
+    return Wrench(*(jnp.asarray(size * rng.normal(size=(2, 3))) for size in (40, 3)))
 
 
 FEET = jnp.array([[0.02, 0.08, 0.0], [-0.03, -0.09, 0.0]])
@@ -43,9 +40,8 @@ def test_momentum_changes_by_the_impulse_of_the_wrench_and_of_a_load(robot):
     def momenta(state):
         R = rotation_from_euler(state.euler)
         spin = R @ robot.inertia @ R.T @ state.ang_velocity
-        return robot.mass * state.velocity, spin + jnp.cross(
-            state.position, robot.mass * state.velocity
-        )
+        linear = robot.mass * state.velocity
+        return linear, spin + jnp.cross(state.position, linear)
 
     state, wrench = some_state(1), some_wrench(1)
     load = Load(jnp.array([3.0, -2.0, 1.0]), jnp.array([0.1, 0.2, -0.3]))

@@ -71,9 +71,8 @@ def test_a_step_in_a_box_is_the_minimum_of_the_model_there(seed):
     low[0] = high[1] = 0.0  # on a wall already
     _, state = begun(0.0, g, H, radius=1e3)
     step = np.asarray(boxed_step(0.0, state, (jnp.asarray(low), jnp.asarray(high))))
-    exact = lsq_linear(
-        np.linalg.cholesky(H).T, np.linalg.solve(np.linalg.cholesky(H), -g), (low, high + 1e-12)
-    )
+    L = np.linalg.cholesky(H)
+    exact = lsq_linear(L.T, np.linalg.solve(L, -g), (low, high + 1e-12))
     model = lambda s: g @ s + 0.5 * s @ H @ s  # noqa: E731
     assert ((low <= step) & (step <= high)).all()
     assert model(step) <= 0.98 * model(exact.x)

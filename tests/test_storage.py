@@ -64,9 +64,7 @@ WIDER = TREE | {"leaf": TREE["leaf"]._replace(force=np.zeros((2, 4)))}
         (TREE, "thing", None, 2, "file format 1, this version reads 2"),
     ],
 )
-def test_another_kind_robot_layout_shape_or_format_is_refused(
-    saved, monkeypatch, like, kind, robot, format, fault
-):
+def test_a_file_of_something_else_is_refused(saved, monkeypatch, like, kind, robot, format, fault):
     monkeypatch.setattr(tree_file, "FORMAT", format)
     with pytest.raises(ValueError, match=f"tree.npz: {fault}"):
         load_tree(saved, like, kind=kind, robot=robot)

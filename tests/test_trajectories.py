@@ -72,9 +72,7 @@ def test_what_is_beyond_the_limits_is_told_by_segment_value_and_range(rows, told
 # On the command line
 
 
-def test_a_walk_lasts_as_long_as_its_file_says_with_a_warning_beyond_the_limits(
-    monkeypatch, capsys, tmp_path
-):
+def test_a_walk_is_as_long_as_its_file_says_and_limits_are_told(monkeypatch, capsys, tmp_path):
     walks = []
 
     def pretend(config, robot, job, **others):

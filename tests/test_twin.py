@@ -38,19 +38,10 @@ def horizon(config, tick=5):
 
 @partial(jax.jit, static_argnums=0)
 def planned(config, tick=5, last=None):
-    both = 2 if config.twin.air_moments else 1
-    return plan(
-        config,
-        ROBOT,
-        config.parameters(expert()),
-        command=named_command("s"),
-        anchor=ANCHOR,
-        tick=jnp.asarray(tick),
-        state=STATE,
-        feet=FEET,
-        last=last,
-        max_contacts=both,
-    )
+    asked = {"command": named_command("s"), "anchor": ANCHOR, "tick": jnp.asarray(tick)}
+    asked["max_contacts"] = 2 if config.twin.air_moments else 1
+    now = {"state": STATE, "feet": FEET, "last": last}
+    return plan(config, ROBOT, config.parameters(expert()), **asked, **now)
 
 
 def twin(**changes):
@@ -139,9 +130,8 @@ def test_the_body_of_a_twin_is_planned_with():
 
 def test_a_limit_of_the_position_error_is_one_from_the_twins_own_reference():
     far = twin(reference=FROM_ROBOT)  # the path is 2 m away
-    free, limited = (
-        planned(replace(far, mpc=MpcConfig(position_limit=limit))).wrench for limit in (None, 0.1)
-    )
+    configs = (replace(far, mpc=MpcConfig(position_limit=limit)) for limit in (None, 0.1))
+    free, limited = (planned(config).wrench for config in configs)
     np.testing.assert_allclose(limited.force, free.force, atol=1e-6)
 
 

@@ -132,9 +132,8 @@ def test_the_description_of_a_robot_states_the_noise_and_the_delay_of_its_tuning
     np.testing.assert_allclose(variation.noise.euler, 0.002)
     assert_same(variation._replace(noise=BELIEVED.noise, delay=0.0), BELIEVED)
     assert variation.delay == 0.005
-    with pytest.raises(
-        InputError, match=r"tuning: .*delay must be a number from 0 to 0.01, got 0.02"
-    ):
+    told = r"tuning: .*delay must be a number from 0 to 0.01, got 0.02"
+    with pytest.raises(InputError, match=told):
         rollout_config(robot_with(delay=0.02))
 
 

@@ -72,9 +72,7 @@ def test_films_and_strips_are_written_with_the_promised_size(robot, tmp_path):
         assert picture.size == (2 * 192, 2 * 324)
 
 
-def test_back_ends_are_tried_in_turn_and_without_any_there_is_one_line(
-    robot, tmp_path, monkeypatch
-):
+def test_back_ends_are_tried_in_turn_and_none_is_one_line(robot, tmp_path, monkeypatch):
     said = (
         "warning\nTraceback (most recent call last):\n  File a\nKeyError: 'sky'\n"
         "Exception ignored in: x\nTraceback (most recent call last):\n  File b\nEGLError: (\n)\n"
@@ -94,9 +92,8 @@ def test_back_ends_are_tried_in_turn_and_without_any_there_is_one_line(
     assert film.read_bytes() == b"film"
     works.clear()
     film.unlink()
-    with pytest.raises(
-        VideoUnavailable, match=r"no film: .*\(egl: KeyError: 'sky'; osmesa: .*"
-    ) as told:
+    line = r"no film: .*\(egl: KeyError: 'sky'; osmesa: .*"
+    with pytest.raises(VideoUnavailable, match=line) as told:
         write_film(film, robot, walks)
     assert "\n" not in str(told.value)
     assert not list(tmp_path.iterdir())

@@ -1,9 +1,6 @@
 """The closed loop in MuJoCo C."""
 
 import json
-import os
-import subprocess
-import sys
 from functools import partial
 from itertools import product
 
@@ -11,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 from model import OTHERS, ROBOT
+from pretend import USUAL, python
 from test_sensing import momentum
 
 from hector_jax.control.controller import WalkConfig
@@ -86,9 +84,7 @@ def test_stance_follows_the_gait_and_a_foot_in_the_air_is_told_nothing(short):
 def test_a_walk_as_the_user_has_it_has_the_losses_that_are_noted():
     """From the command line, with the optimisations that the tests leave out."""
     words = "walk --traj s --seconds 0.5 --world hfs --weights expert --json".split()
-    usual = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    line = [sys.executable, "-m", "hector_jax", *words]
-    told = json.loads(subprocess.run(line, env=usual, capture_output=True, check=True).stdout)
+    told = json.loads(python("-m", "hector_jax", *words, env=USUAL, check=True).stdout)
     noted = {"L_Eul": 1.2055268, "L_pos": 2.4811933, "L_ctrl": 61943.913}
     assert {name: told[name] for name in noted} == pytest.approx(noted, rel=1e-3)
     assert (told["fell"], told["plans"], told["unsolved"]) == (False, 50, 0)
@@ -161,9 +157,8 @@ def test_expert_weights_walk_in_hfs_and_on_the_standin():
 def test_a_push_moves_the_robot_and_the_sensed_wrench_stays_the_grounds(short):
     """What the whole robot gains is from the ground, its weight and the push, in every sample."""
     push = Push(np.array([[0.0, 30.0, 0.0]]), start=np.array([0.02]), duration=np.array([0.05]))
-    pushed, gained = walk_and_gain(
-        Job(expert(), named_command("straight"), ideal(), 0.1, push=push)
-    )
+    job = Job(expert(), named_command("straight"), ideal(), 0.1, push=push)
+    pushed, gained = walk_and_gain(job)
     assert (pushed.state.velocity[70] - short.state.velocity[70])[1] > 0.05
     rest = gained[:, 1] - pushed.effect.force.sum(axis=1)[:99, 1]
     on = (np.arange(99) >= 20) & (np.arange(99) < 70)

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 import pytest
 from model import AHEAD, HEIGHT, ROBOT, ROOT
-from pretend import call
+from pretend import USUAL, call
 
 from hector_jax.control.controller import walk_config
 from hector_jax.control.weights import expert, nominal
@@ -254,8 +254,7 @@ def test_a_program_gets_what_the_command_was_started_with(tmp_path):
     path.chmod(0o755)
     folder = tmp_path / "elsewhere"
     folder.mkdir()
-    usual = {n: x for n, x in os.environ.items() if n != "XLA_FLAGS"}
-    usual |= {"JAX_ENABLE_X64": "1", "PWD": str(folder), "PYTHONPATH": str(ROOT)}
+    usual = USUAL | {"JAX_ENABLE_X64": "1", "PWD": str(folder), "PYTHONPATH": str(ROOT)}
     line = [sys.executable, tmp_path / "show.py", path, str(core)]
     subprocess.run(line, cwd=folder, env=usual, check=True)
     for log in ("here", "there"):

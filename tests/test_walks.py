@@ -13,8 +13,8 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
-from model import AHEAD, BRIEF
-from pretend import HandsOver
+from model import AHEAD, BRIEF, vector
+from pretend import HandsOver, files
 
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import (
@@ -43,17 +43,12 @@ from hector_jax.walk_tuning.best_set import drawn_plants
 
 # all walks of this file are of these ticks and this command: one set of programs for all tests
 CONFIG, COMMAND, SECONDS = TuneConfig(rollout=BRIEF, least_gain=1e-6), {"short": AHEAD}, 0.05
-SETS = 3
+SETS, POOL = 3, HandsOver()
 
 
 @pytest.fixture(scope="module")
 def robot():
     return jax.tree.map(np.asarray, load_robot())
-
-
-@pytest.fixture(scope="module")
-def pool():
-    return HandsOver()
 
 
 def campaign(folder, robot, plants=(None,), **others):
@@ -77,9 +72,9 @@ def same_sets(a, b):
 
 
 @pytest.fixture(scope="module")
-def in_process(robot, pool, tmp_path_factory):
+def in_process(robot, tmp_path_factory):
     one = campaign(tmp_path_factory.mktemp("walked"), robot, [hfs()])
-    return one, walks.tune_on_walks(pool, one, walks=SETS)
+    return one, walks.tune_on_walks(POOL, one, walks=SETS)
 
 
 def walked(robot, weights, path):
@@ -88,18 +83,16 @@ def walked(robot, weights, path):
     return path
 
 
-def test_walks_through_files_equal_those_in_process_to_the_last_bit(
-    robot, pool, in_process, tmp_path
-):
+def test_walks_through_files_are_those_in_process_to_the_last_bit(robot, in_process, tmp_path):
     one, (_, theirs) = campaign(tmp_path, robot), in_process
     for number in range(SETS):
-        found = added_logs.read_campaign(pool, one)  # as a new process would
+        found = added_logs.read_campaign(POOL, one)  # as a new process would
         assert (found.number, found.again, found.tuning.reason) == (number, None, "")
         waiting = load_weights(walks.weights_path(tmp_path, number), robot)
         assert same(waiting, found.waiting)
         log = walked(robot, waiting, tmp_path / f"{number}.npz")
         added_logs.add_logs(one, number, [log])
-    mine = added_logs.read_campaign(pool, one).tuning
+    mine = added_logs.read_campaign(POOL, one).tuning
     assert same_sets(mine.sets, theirs.sets)
     assert [x.accepted for x in mine.sets].count(True) > 1
     assert mine.best == theirs.best > 0
@@ -107,15 +100,15 @@ def test_walks_through_files_equal_those_in_process_to_the_last_bit(
     assert theirs.reason == f"{SETS - 1} iterations"
 
 
-def test_what_was_walked_is_not_walked_again(monkeypatch, pool, in_process):
+def test_what_was_walked_is_not_walked_again(monkeypatch, in_process):
     one, first = in_process
     monkeypatch.setattr(walks, "walk_case", None)
-    again = walks.tune_on_walks(pool, one, walks=SETS)
+    again = walks.tune_on_walks(POOL, one, walks=SETS)
     assert same_sets(again.sets, first.sets)
     assert again.best == first.best
 
 
-def test_any_engine_walks_and_is_recorded(robot, pool, in_process, tmp_path):
+def test_any_engine_walks_and_is_recorded(robot, in_process, tmp_path):
     jobs = []
 
     def walk_in(pool, config, robot, some, **options):
@@ -127,9 +120,9 @@ def test_any_engine_walks_and_is_recorded(robot, pool, in_process, tmp_path):
     score = walks.walk_case(one, nominal(robot), 0)
     assert len(jobs) == 1
     assert score.loss == in_process[1].sets[0].losses[0]
-    assert walks.tune_on_walks(pool, one, waits).sets == []  # begins the record
+    assert walks.tune_on_walks(POOL, one, waits).sets == []  # begins the record
     with pytest.raises(InputError, match="made with engine .mine"):
-        walks.tune_on_walks(pool, replace(one, engine=MUJOCO_C), waits)
+        walks.tune_on_walks(POOL, replace(one, engine=MUJOCO_C), waits)
 
 
 def test_the_reference_of_a_log_is_that_of_its_walk(robot):
@@ -177,12 +170,14 @@ def toy_case(campaign, weights, case):
     return walk_log.ScoredLog(toy_loss(weights, case), LOG)
 
 
+def logs(*losses):
+    return [walk_log.ScoredLog(x, LOG) for x in losses]
+
+
 def asked(number, weights, cases=1, fell=lambda number, case, weights: False):
     """The scored logs of a set, by the toy; those that fell have no loss."""
-    losses = [
-        np.inf if fell(number, case, weights) else toy_loss(weights, case) for case in range(cases)
-    ]
-    return [walk_log.ScoredLog(x, LOG) for x in losses]
+    found = (np.inf if fell(number, c, weights) else toy_loss(weights, c) for c in range(cases))
+    return logs(*found)
 
 
 def waits(number, weights):
@@ -240,9 +235,7 @@ def test_of_several_starts_one_that_falls_less_often_is_taken(monkeypatch, toy):
 
 
 @pytest.mark.parametrize("killed_at", [0, 1, 4, 5])
-def test_a_run_that_is_killed_keeps_each_walk_and_ends_as_one_that_is_not(
-    monkeypatch, toy, killed_at
-):
+def test_a_killed_run_keeps_each_walk_and_ends_as_one_that_is_not(monkeypatch, toy, killed_at):
     whole = walks.tune_on_walks(HERE, toy(folder="whole"), walks=9)
     assert [case for case, _ in WALKED] == 3 * [0, 1, 2]
     WALKED.clear()
@@ -260,9 +253,8 @@ def test_a_run_that_is_killed_keeps_each_walk_and_ends_as_one_that_is_not(
     assert [case for case, _ in WALKED] == 3 * [0, 1, 2]  # none twice
     assert same_sets(again.sets, whole.sets)
     for name in ("walks.jsonl", *(f"weights/{i}.json" for i in range(3))):
-        assert (toy().folder / name).read_bytes() == (
-            toy(folder="whole").folder / name
-        ).read_bytes()
+        cut, uncut = ((toy(folder=x).folder / name).read_bytes() for x in ("toy", "whole"))
+        assert cut == uncut
 
 
 def test_a_walk_is_kept_as_it_ends_though_one_before_it_has_not(monkeypatch, toy):
@@ -327,9 +319,7 @@ def test_the_walks_count_where_the_code_would_now_step_elsewhere(toy):
     one, elsewhere = toy(cases=1), expert()
     save_weights(walks.weights_path(one.folder, 1), elsewhere)
     found = walks.tune_on_walks(HERE, one, walks=4)
-    np.testing.assert_allclose(
-        weights_to_vector(found.sets[1].weights), weights_to_vector(elsewhere), rtol=1e-12
-    )
+    np.testing.assert_allclose(vector(found.sets[1].weights), vector(elsewhere), rtol=1e-12)
     assert found.sets[1].losses[0] == pytest.approx(toy_loss(elsewhere, 0))
 
 
@@ -344,9 +334,7 @@ def test_a_fall_is_a_bounded_loss_of_its_case_and_has_no_slope(toy):
     worst = np.e * max(start[0], start[2])
     of_start = np.exp(np.mean(np.log([start[0], worst, start[2]])))
     assert float(objective.slope(at)[0].loss) == pytest.approx(of_start)
-    objective.ask = lambda number, weights: [
-        walk_log.ScoredLog(x, LOG) for x in (start[0], np.inf, 1e3 * start[2])
-    ]
+    objective.ask = lambda number, weights: logs(start[0], np.inf, 1e3 * start[2])
     found, _ = objective.slope(at)
     value = np.exp(np.mean(np.log([start[0], worst, worst])))
     assert float(found.loss) == pytest.approx(value)
@@ -354,9 +342,7 @@ def test_a_fall_is_a_bounded_loss_of_its_case_and_has_no_slope(toy):
     expected = value / 3.0 * sum(g / start[c] for g, c in zip(slopes, (0, 2), strict=True))
     np.testing.assert_allclose(weights_to_vector(found.gradient), expected, rtol=1e-12)
     assert float(found.fallen) == 0.0
-    objective.ask = lambda number, weights: [
-        walk_log.ScoredLog(x, LOG) for x in (np.inf, np.inf, start[2])
-    ]
+    objective.ask = lambda number, weights: logs(np.inf, np.inf, start[2])
     assert float(objective.slope(at)[0].fallen) == 1.0  # it falls in more cases than the start
 
 
@@ -417,11 +403,11 @@ def test_from_a_start_that_falls_in_all_cases_nothing_is_tuned_and_in_one_it_is(
 )
 def test_the_record_of_another_tuning_is_refused_in_one_line(toy, change, words):
     walks.tune_on_walks(HERE, one := toy(), walks=3)
-    before = {path: path.read_bytes() for path in one.folder.rglob("*") if path.is_file()}
+    before = files(one.folder)
     told = f"^{one.folder / 'walks.jsonl'}: {words}.*; choose another folder$"
     with pytest.raises(InputError, match=told):
         walks.tune_on_walks(HERE, replace(one, **change(one)), walks=3)
-    assert {path: path.read_bytes() for path in before} == before
+    assert files(one.folder) == before
 
 
 def test_a_record_or_a_log_that_is_damaged_is_refused_in_one_line(toy):
