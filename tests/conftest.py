@@ -24,7 +24,6 @@ import pytest  # noqa: E402
 from hypothesis import configuration  # noqa: E402
 
 from hector_jax.core.runtime import setup_jax  # noqa: E402
-from hector_jax.robot.model import load_robot  # noqa: E402
 
 setup_jax()
 sys.path.append(str(Path(__file__).parents[1] / "experiments"))  # scripts import their helpers so
@@ -46,12 +45,6 @@ def _forget_programs():
         return
     if crowded:
         jax.clear_caches()
-
-
-@pytest.fixture(scope="session")
-def robot():
-    """HECTOR."""
-    return load_robot()
 
 
 @pytest.fixture(scope="module")

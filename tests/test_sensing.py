@@ -128,7 +128,7 @@ def test_yaw_goes_on_past_half_a_turn():
     [(0.2, 0.0, True, False), (1.0, 0.0, False, False), (1.0, 0.3, False, True)],
     ids=["knees on the floor", "in the air", "legs crossed"],
 )
-def test_what_touches_is_told_and_feet_on_the_floor_have_a_wrench(height, inwards, floor, legs):
+def test_what_touches_is_told_and_only_feet_on_the_floor_push(height, inwards, floor, legs):
     world, data, _ = stand(ideal(), steps=0)
     roll = inwards * np.array([0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
     data.qpos[:] = standing_qpos(world, ROBOT.standing_joints + roll, height)

@@ -6,6 +6,7 @@ import imageio_ffmpeg
 import mujoco
 import numpy as np
 import pytest
+from model import ROBOT
 from PIL import Image
 from pretend import instead, pretend_walk
 from scipy.spatial.transform import Rotation
@@ -18,25 +19,25 @@ from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film, w
 from hector_jax.robot.description import MODEL_PATH
 
 
-def test_a_drawn_pose_has_the_walked_centre_of_mass_and_attitude(robot):
+def test_a_drawn_pose_has_the_walked_centre_of_mass_and_attitude():
     euler, position = np.array([[0.1, -0.2, 2.5]]), np.array([[0.3, -0.4, 0.5]])
     state = State(euler, position, np.zeros((1, 3)), np.zeros((1, 3)))
     model = mujoco.MjModel.from_xml_path(str(MODEL_PATH))
     data = mujoco.MjData(model)
-    data.qpos = poses(robot, state, np.asarray(robot.standing_joints)[None])[0]
+    data.qpos = poses(ROBOT, state, np.asarray(ROBOT.standing_joints)[None])[0]
     mujoco.mj_forward(model, data)
     np.testing.assert_allclose(data.subtree_com[1], position[0], atol=1e-9)
     expected = Rotation.from_euler("ZYX", euler[0, ::-1]).as_matrix()
     np.testing.assert_allclose(data.xmat[1].reshape(3, 3), expected, atol=1e-9)
 
 
-def test_a_film_shows_the_state_of_its_time_and_after_a_fall_the_last_one(robot):
+def test_a_film_shows_the_state_of_its_time_and_after_a_fall_the_last_one():
     slow, fast = (pretend_walk(seconds=1.0, period=p, fall_at=0.5) for p in (0.01, 0.001))
-    one, other = motions(robot, {"a": slow, "b": fast}).values()
+    one, other = motions(ROBOT, {"a": slow, "b": fast}).values()
     times = 0.04 * np.arange(26)
     assert one.sample_at(times)[[0, 10, 25]].tolist() == [0, 39, 99]
     assert other.sample_at(times)[[0, 10, 25]].tolist() == [0, 399, 999]
-    trunk = poses(robot, State(*(x[39:40] for x in slow.state)), slow.joints[39:40])
+    trunk = poses(ROBOT, State(*(x[39:40] for x in slow.state)), slow.joints[39:40])
     np.testing.assert_allclose(one.qpos[39], trunk[0])
     assert one.fall_time == pytest.approx(0.5)
     for values in (one.qpos, one.path):
@@ -45,12 +46,12 @@ def test_a_film_shows_the_state_of_its_time_and_after_a_fall_the_last_one(robot)
 
 
 @pytest.mark.filterwarnings("ignore:os.fork")  # of the reader used here, not of the writer
-def test_films_and_strips_are_written_with_the_promised_size(robot, tmp_path):
+def test_films_and_strips_are_written_with_the_promised_size(tmp_path):
     walks = {"nominal": pretend_walk(0, 0.05, 0.2), "with": pretend_walk(1, 0.01, 0.2)}
-    walks = motions(robot, walks)
+    walks = motions(ROBOT, walks)
     config = VideoConfig(width=640, height=432, rate=10, tiles=2)
     try:
-        write_film(tmp_path / "film.mp4", robot, walks, config)
+        write_film(tmp_path / "film.mp4", ROBOT, walks, config)
     except VideoUnavailable as error:
         pytest.skip(str(error))
     frames = imageio_ffmpeg.read_frames(tmp_path / "film.mp4")
@@ -64,15 +65,15 @@ def test_films_and_strips_are_written_with_the_promised_size(robot, tmp_path):
     # the plot below is pale where time has not come yet
     first, _, last = (np.sum(np.ptp(picture[324:], axis=-1) > 60) for picture in pictures)
     assert last > first + 20
-    write_film(tmp_path / "film.webp", robot, walks, config)
+    write_film(tmp_path / "film.webp", ROBOT, walks, config)
     with Image.open(tmp_path / "film.webp") as picture:
         assert (picture.size, picture.n_frames, picture.info["loop"]) == ((640, 432), 3, 0)
-    write_strip(tmp_path / "strip.png", robot, walks, config)
+    write_strip(tmp_path / "strip.png", ROBOT, walks, config)
     with Image.open(tmp_path / "strip.png") as picture:
         assert picture.size == (2 * 192, 2 * 324)
 
 
-def test_back_ends_are_tried_in_turn_and_none_is_one_line(robot, tmp_path, monkeypatch):
+def test_back_ends_are_tried_in_turn_and_none_is_one_line(tmp_path, monkeypatch):
     said = (
         "warning\nTraceback (most recent call last):\n  File a\nKeyError: 'sky'\n"
         "Exception ignored in: x\nTraceback (most recent call last):\n  File b\nEGLError: (\n)\n"
@@ -87,20 +88,20 @@ def test_back_ends_are_tried_in_turn_and_none_is_one_line(robot, tmp_path, monke
 
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     instead(monkeypatch, video.subprocess, "run", child)
-    walks, film = dict.fromkeys("ab", motion(robot, pretend_walk(seconds=0.1))), tmp_path / "a.mp4"
-    assert write_film(film, robot, walks) == "osmesa"
+    walks, film = dict.fromkeys("ab", motion(ROBOT, pretend_walk(seconds=0.1))), tmp_path / "a.mp4"
+    assert write_film(film, ROBOT, walks) == "osmesa"
     assert film.read_bytes() == b"film"
     works.clear()
     film.unlink()
     line = r"no film: .*\(egl: KeyError: 'sky'; osmesa: .*"
     with pytest.raises(VideoUnavailable, match=line) as told:
-        write_film(film, robot, walks)
+        write_film(film, ROBOT, walks)
     assert "\n" not in str(told.value)
     assert not list(tmp_path.iterdir())
 
 
-def test_what_cannot_be_filmed_is_refused(robot, tmp_path):
+def test_what_cannot_be_filmed_is_refused(tmp_path):
     with pytest.raises(ValueError, match="two walks side by side, got 1"):
-        write_film(tmp_path / "film.mp4", robot, {"a": motion(robot, pretend_walk(seconds=0.1))})
+        write_film(tmp_path / "film.mp4", ROBOT, {"a": motion(ROBOT, pretend_walk(seconds=0.1))})
     with pytest.raises(InputError, match=r"must end in .mp4, .webp, .gif, .png, got film.avi"):
         video.check_film(tmp_path / "film.avi")

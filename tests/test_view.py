@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 from browser import CHROMIUM, opened
-from model import small_net
+from model import ROBOT, small_net
 from pretend import call, elsewhere, instead, pretend_history, pretend_walk
 
 from hector_jax.cli import arguments
@@ -25,7 +25,6 @@ from hector_jax.grfm.network import save_net
 from hector_jax.report import fidelity, pictures, view
 from hector_jax.report.motion import motion
 from hector_jax.report.view import ViewedWalk, arrows
-from hector_jax.robot.model import load_robot
 from hector_jax.store import folder as runs
 from hector_jax.store.cache import robot_hash
 
@@ -39,7 +38,7 @@ def viewed(seed=0, **kwargs):
 def pretend_run(folder):
     """The folder of a run, as far as a page reads it."""
     loss = {"euler": 1e5, "position": 2e5}
-    flags, body = as_table(Tune(data=folder / "data")), robot_hash(load_robot())
+    flags, body = as_table(Tune(data=folder / "data")), robot_hash(ROBOT)
     write_json(folder / "config.json", {"flags": flags, "robot": body, "tune": {"loss": loss}})
     write_metrics(folder, 12)
     return folder
@@ -55,9 +54,9 @@ def write_metrics(folder, iterations, refused=()):
 
 
 @pytest.mark.parametrize("size", [1.0, 2.0])
-def test_an_arrow_has_the_direction_of_its_force_and_the_scale_of_its_robot(robot, size):
+def test_an_arrow_has_the_direction_of_its_force_and_the_scale_of_its_robot(size):
     """The weight is drawn five sixths of the standing height long, whatever the robot's size."""
-    robot = robot._replace(mass=size**3 * robot.mass, standing_height=size * robot.standing_height)
+    robot = ROBOT._replace(mass=size**3 * ROBOT.mass, standing_height=size * ROBOT.standing_height)
     weight, height = float(robot.mass * robot.gravity[2]), float(robot.standing_height)
     one = viewed(seconds=2.0, turn=np.pi / 4)
     ahead = np.zeros((200, 2, 3))
@@ -78,10 +77,10 @@ def test_an_arrow_has_the_direction_of_its_force_and_the_scale_of_its_robot(robo
     np.testing.assert_allclose(drawn("moment", "measured")[..., 2], up)
 
 
-def test_both_walks_stand_on_one_reference_wherever_they_began(robot):
+def test_both_walks_stand_on_one_reference_wherever_they_began():
     one = viewed(seconds=0.5, turn=1.0)
-    found = motion(robot, *one)
-    other = motion(robot, *one._replace(walk=elsewhere(one.walk, (0.3, -0.2), 0.4)))
+    found = motion(ROBOT, *one)
+    other = motion(ROBOT, *one._replace(walk=elsewhere(one.walk, (0.3, -0.2), 0.4)))
     for name in ("reference", "path", "qpos", "soles"):
         np.testing.assert_allclose(getattr(other, name), getattr(found, name), atol=1e-9)
     ends = arrows(other, "force", "commanded")  # wrenches are of the yaw frame in any case
@@ -170,7 +169,7 @@ def test_only_the_net_of_the_run_predicts(monkeypatch, capsys, tmp_path, own):
     instead(monkeypatch, fidelity, "curves", lambda *args: drawn.append(args[2]) or {})
     instead(monkeypatch, pictures, "of_view", lambda *args: None)
     run = pretend_run(tmp_path / "run")
-    save_net(run / "data" / "grfm.npz", net, robot=load_robot(), about={})
+    save_net(run / "data" / "grfm.npz", net, robot=ROBOT, about={})
     path = run / "config.json"
     write_json(path, json.loads(path.read_text()) | {"net": tree_hash(net) if own else "another"})
     words = ["--world", "srbm", "--sets", "nominal", "expert", "--out", tmp_path / "out"]
