@@ -200,9 +200,9 @@ CALL = """
 import sys
 from pathlib import Path
 from hector_jax.core.console import exit_code
-from hector_jax.own.program import program_of, run
+from hector_jax.own.program import call_program, program_of
 walker = program_of(Path(sys.argv[1]), 60.0)
-sys.exit(exit_code("toy", lambda: run(walker, Path("request"), Path("log"))))
+sys.exit(exit_code("toy", lambda: call_program(walker, Path("request"), Path("log"))))
 """
 
 
@@ -232,16 +232,16 @@ SHOW = """
 import os, sys
 from pathlib import Path
 from hector_jax.core.runtime import setup_jax, workers
-from hector_jax.own.program import program_of, run
+from hector_jax.own.program import call_program, program_of
 if __name__ == "__main__":
     os.sched_setaffinity(0, {int(sys.argv[2])})
     setup_jax()
     call = program_of(Path(sys.argv[1]), 60.0), Path("request")
     os.sched_setaffinity(0, range(64))
-    run(*call, Path("here"))
+    call_program(*call, Path("here"))
     os.sched_setaffinity(0, {int(sys.argv[2])})
     with workers(1) as pool:
-        pool.submit(run, *call, Path("there")).result()
+        pool.submit(call_program, *call, Path("there")).result()
 """
 
 

@@ -19,7 +19,7 @@ from hector_jax.core.runtime import workers
 from hector_jax.core.trajectory import FEET
 from hector_jax.own.log_check import check_log, read_check
 from hector_jax.own.parity import COMPONENTS, Parity, compare_plans
-from hector_jax.own.planner import Calls, compare_calls
+from hector_jax.own.planner import Calls, compare_calls, plan_inputs
 from hector_jax.own.program import program_of
 from hector_jax.own.walk_file import read_walk
 from hector_jax.own.walk_log import at_ticks, log_of, trajectory_of
@@ -57,11 +57,15 @@ def run_twin(args: Twin) -> None:
     seconds = arguments.walk_seconds(args, trajectory)
     walk, end = read_walk(args.log, robot, seconds, config.gait.tick)
     weights = arguments.weights_by_name(args.weights, robot)
-    inputs, calls = (config, robot, weights, trajectory.command), None
+    calls = None
     if args.planner:
         ticks = trajectory_of(at_ticks(log_of(walk), config.gait.tick))
-        calls = compare_calls(program_of(args.planner, _LIMIT), *inputs, ticks)
-    parity = calls.parity if calls else compare_plans(*inputs, walk)
+        inputs = plan_inputs(config, robot, weights, trajectory.command, ticks)
+        planner = program_of(args.planner, _LIMIT)
+        calls = compare_calls(planner, config, robot, inputs, ticks)
+        parity = calls.parity
+    else:
+        parity = compare_plans(config, robot, weights, trajectory.command, walk)
     result = _parity_result(parity) | {"ended": end}
     lines = [*([end] if end else []), *_parity_lines(result, robot, args.planner)]
     if calls:

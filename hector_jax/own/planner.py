@@ -24,7 +24,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree_file import named_leaves
 from hector_jax.own.parity import Parity
-from hector_jax.own.program import Program, run
+from hector_jax.own.program import Program, call_program
 from hector_jax.own.walk_file import read_entries
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.called import CalledPlans, PlanInputs, Planned, call_along, move_sizes
@@ -37,13 +37,13 @@ def call_planner(planner: Program, asked: PlanInputs) -> Planned:
     """Let a program plan.
 
     Raises:
-        InputError: see `program.run`; or an entry of its plans is missing or of another shape.
+        InputError: see `program.call_program`; or an entry of its plans is missing or wrong.
     """
     rows, feet = asked.contact.shape
     with TemporaryDirectory(prefix="hector-plan-") as folder:
         inputs, plans = Path(folder) / "inputs.npz", Path(folder) / "plans.npz"
         np.savez(inputs, **named_leaves(asked))
-        run(planner, inputs, plans)
+        call_program(planner, inputs, plans)
         found = read_entries(plans, Planned._fields)
     for name in Planned._fields:
         got = np.shape(found.get(name, "none"))
@@ -61,8 +61,17 @@ def plan_inputs(
     Args:
         config, robot: tick of the gait; the nominal body.
         weights, command: of the walk.
-        walk: at the plan interval, without a fall.
+        walk: at the plan interval; up to a fall.
+
+    Raises:
+        InputError: the walk is shorter than two plans.
     """
+    if (stood := int(np.sum(~walk.fallen))) < 3:
+        raise InputError(f"a walk of at least two plans of {config.plan_interval:g} s is needed")
+    samples = walk._replace(period=None, initial=None)
+    walk = jax.tree.map(lambda x: x[:stood], samples)._replace(
+        period=walk.period, initial=walk.initial
+    )
     _, begins = begins_of_ticks(robot, walk)
     stands = walk.contact if walk.contact.any() else np.any(walk.command.force != 0.0, axis=-1)
     return PlanInputs(
@@ -102,32 +111,23 @@ class Calls(NamedTuple):
 
 
 def compare_calls(
-    planner: Program,
-    config: WalkConfig,
-    robot: Robot,
-    weights: Weights,
-    command: Command,
-    walk: Trajectory,
+    planner: Program, config: WalkConfig, robot: Robot, inputs: PlanInputs, walk: Trajectory
 ) -> Calls:
     """Call a planner along a log, and compare its plans with the commands of the log.
 
     Args:
         planner: the program.
-        config, robot, weights, command, walk: as for `plan_inputs`; the walk may end in a fall.
+        config, robot: of `plan_inputs`.
+        inputs: of the walk.
+        walk: the log.
 
     Raises:
-        InputError: see `call_planner`; or the walk is shorter than two plans.
+        InputError: see `call_planner`.
     """
-    if (stood := int(np.sum(~walk.fallen))) < 3:
-        raise InputError(f"a walk of at least two plans of {config.plan_interval:g} s is needed")
-    samples = walk._replace(period=None, initial=None)
-    walk = jax.tree.map(lambda x: x[:stood], samples)._replace(
-        period=walk.period, initial=walk.initial
-    )
-    inputs = plan_inputs(config, robot, weights, command, walk)
     first, second = (called_plans(planner, config, inputs) for _ in range(2))
     row, foot = np.nonzero(first.made[:, None] & first.contact)
-    logged, called = np.concatenate(walk.command, axis=-1)[1:], np.asarray(first.values)[..., :6]
+    logged = np.concatenate(walk.command, axis=-1)[1:]
+    called = np.asarray(first.values)[..., :6]
     parity = Parity(
         time=inputs.time[row],
         foot=foot,
@@ -142,7 +142,7 @@ def compare_calls(
     by_body, by_weights = np.split(first.slopes[first.made], [body], axis=-1)
     changes = np.abs(by_body[..., :6, :]).max(axis=(1, 2)) * move_sizes(body)
     weight = float(robot.mass * np.linalg.norm(robot.gravity))
-    names = step_names(weights, tuple(weights.others))
+    names = step_names(inputs.weights, tuple(inputs.weights.others))
     idle = np.abs(by_weights).max(axis=(0, 1, 2)) == 0.0
     return Calls(
         parity,

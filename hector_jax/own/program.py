@@ -122,7 +122,7 @@ sys.exit(code if code >= 0 else 128 - code)
 """
 
 
-def run(program: Program, asked: Path, answer: Path) -> None:
+def call_program(program: Program, asked: Path, answer: Path) -> None:
     """Run a program, and end it with all that it started when its time is over.
 
     Raises:

@@ -28,7 +28,7 @@ from hector_jax.core.console import say
 from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory, no_samples
-from hector_jax.own.program import Program, run
+from hector_jax.own.program import Program, call_program
 from hector_jax.own.walk_file import FLAGS, read_walk, reference_of
 from hector_jax.robot.model import Robot
 from hector_jax.sim.engine import Engine
@@ -121,12 +121,12 @@ def write_log(walker: Program, job: Job, log: Path) -> None:
     """Let a program walk and write its log.
 
     Raises:
-        InputError: see `program.run`.
+        InputError: see `program.call_program`.
     """
     with TemporaryDirectory(prefix="hector-walk-") as folder:
         request = Path(folder) / "request.json"
         request.write_text(json.dumps(_request(job)))
-        run(walker, request, log)
+        call_program(walker, request, log)
 
 
 def _request(job: Job) -> dict[str, Any]:

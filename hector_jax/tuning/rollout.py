@@ -198,6 +198,29 @@ def _sample(
     )
 
 
+def _own_planner(
+    config: RolloutConfig,
+    scenario: Scenario,
+    weights: Weights,
+    carry: Carry,
+    tick: Int[Array, ""],
+) -> Callable[..., Plan]:
+    """Return this project's controller as a function of the estimated `state` and `feet`."""
+    walk = config.walk
+    return partial(
+        plan,
+        walk,
+        scenario.robot,
+        walk.parameters(weights),
+        command=scenario.command,
+        anchor=carry.anchor,
+        tick=tick,
+        disturbance=carry.disturbance,
+        last=jax.tree.map(lambda w: w[0], carry.commands),
+        max_contacts=contacts_needed(walk, 0),
+    )
+
+
 def step_carry(
     config: RolloutConfig,
     scenario: Scenario,
@@ -223,19 +246,9 @@ def step_carry(
     state, feet, drift = _estimate(carry, tick, variation)
     if error is not None:
         state, feet = jax.tree.map(jnp.add, (carry.state, carry.feet), tuple(error))
-    if planner is None:
-        planner = partial(
-            plan,
-            walk,
-            robot,
-            walk.parameters(weights),
-            command=command,
-            anchor=anchor,
-            tick=tick,
-            disturbance=carry.disturbance,
-            last=jax.tree.map(lambda w: w[0], carry.commands),
-            max_contacts=contacts_needed(walk, 0),
-        )
+    planner = planner or _own_planner(
+        config, scenario, weights, carry._replace(anchor=anchor), tick
+    )
     planned = planner(state=state, feet=feet)
     planned = planned if wrench is None else planned._replace(wrench=wrench)
     commands = jax.tree.map(
