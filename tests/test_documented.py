@@ -109,7 +109,7 @@ PAIRS = [
     "hector view runs/net",
     "hector tune --resume runs/net",
     "hector evaluate --runs runs/smooth runs/net",
-    "hector tune --walker mine.py --robot mine.toml --walks 4 --out runs/own",
+    "hector tune --walker mine.py --planner plans.py --robot mine.toml --walks 4 --out runs/own",
     "hector tune --resume runs/own",
 ]
 """Lines of flags that meet in the code, in an order in which each has its input."""
@@ -164,6 +164,7 @@ def console(tmp_path_factory):
                 text = SHORT.format(f"{length}-{name}", seconds, speed)
                 Path(f"{length}/{name}.toml").write_text(text)
         Path("mine.py").symlink_to(own / "walker.py")
+        Path("plans.py").symlink_to(own / "planner.py")
         Path("hector.xml").symlink_to(own / "hector.xml")
         for name in ("mine", "twin"):
             Path(f"{name}.toml").symlink_to(own / "twin.toml")

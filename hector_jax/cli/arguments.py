@@ -9,7 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from hector_jax.cli.flags import Check, Collect, Evaluate, Train, Tune, View, Walk
+from hector_jax.cli.flags import (
+    ByPlanner,
+    ByWalker,
+    Check,
+    Collect,
+    Evaluate,
+    Train,
+    Tune,
+    View,
+    Walk,
+)
 from hector_jax.control import trajectories
 from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import gait_named
@@ -23,7 +33,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import to_table
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree_file import ROBOT_DIGITS, read_card, tree_hash
-from hector_jax.own.program import program_of
+from hector_jax.own.program import Program, program_of
 from hector_jax.own.walker import Walker, walker_engine
 from hector_jax.robot.description import Description
 from hector_jax.robot.model import Robot, load_robot
@@ -66,6 +76,14 @@ def engine_of(args: Evaluate | Tune | Walk) -> Engine:
     program = program_of(args.walker, args.walker_limit, args.walker_uses)
     strict = not isinstance(args, Tune)  # which goes on over night
     return walker_engine(Walker(program, strict, args.out if isinstance(args, Walk) else None))
+
+
+def planner_of(args: ByPlanner) -> Program | None:
+    """Return the program that plans, or None; InputError if it is not there."""
+    if args.planner is None:
+        return None
+    settings = args if isinstance(args, ByWalker) else ByWalker()
+    return program_of(args.planner, settings.walker_limit, settings.walker_uses)
 
 
 def short_names(texts: Sequence[str]) -> dict[str, str]:

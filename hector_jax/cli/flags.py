@@ -132,6 +132,14 @@ class ByWalker(Flags):
     walker_uses: tuple[Path, ...] = ()  # files and folders that decide its walks too
 
 
+@dataclass(frozen=True, kw_only=True)
+class ByPlanner(Flags):
+    """A command that may ask a program of the user for its plans."""
+
+    # program that plans as the controller of the walks does, in place of a twin (docs/howto/own.md)
+    planner: Annotated[Path | None, PathKind.FILE] = None
+
+
 @_command
 class Collect(ForRobot, Parallel):
     """Walk on the high-fidelity simulator and record the measured ground forces.
@@ -172,7 +180,7 @@ class Grfm(Parallel, Printed):
 
 
 @_command
-class Tune(Configured, ByWalker, Parallel):
+class Tune(Configured, ByWalker, ByPlanner, Parallel):
     """Tune the MPC weights for trajectories, with and without the net, and evaluate them.
 
     Example: hector tune --traj straight c s --seeds 32
@@ -203,14 +211,12 @@ class Tune(Configured, ByWalker, Parallel):
     # drawn plants of these walks, 0 for the simulator; by default twelve, or as --walks allows
     walk_plants: Annotated[int | None, Range(0, 1000)] = None
     walk_engine: WalkEngine = "c"  # of these walks; c: MuJoCo; extras: drake, pinocchio
-    # program that plans as --walker does, which slopes come from, not from [twin]
-    planner: Annotated[Path | None, PathKind.FILE] = None
     json: bool = False  # print JSON instead of the table; `run` is the folder
     robot: RobotFile = None  # TOML file of another robot, with its data in DATA/NAME; or HECTOR
 
 
 @_command
-class Propose(ForRobot, Printed):
+class Propose(ForRobot, ByPlanner, Printed):
     """Say which weights a robot, or a simulator elsewhere, is to walk with next.
 
     Example: hector propose runs/robot --traj s
@@ -293,14 +299,13 @@ class Check(ForRobot, Printed):
 
 
 @_command
-class Twin(Check):
+class Twin(Check, ByPlanner):
     """Plan a log again, by the robot's file or by a program, and say how far these plans are off.
 
     Example: hector log twin mine.npz --robot mine.toml --traj straight --weights mine.json
     """
 
     weights: Weights = "nominal"  # with which the log was walked: a file, nominal, expert or best
-    planner: Annotated[Path | None, PathKind.FILE] = None  # program that plans, in place of a twin
 
 
 @_command

@@ -175,4 +175,5 @@ def _campaign(args: Propose) -> Campaign:
     start = str(walks.weights_path(args.folder, 0)) if begun else args.start
     start = arguments.weights_by_name(start, robot)
     commands = {trajectory.name: trajectory.command for trajectory in trajectories}
-    return Campaign(args.folder, config, robot, start, commands)
+    planner = arguments.planner_of(args)
+    return Campaign(args.folder, config, robot, start, commands, planner=planner)

@@ -36,8 +36,6 @@ from hector_jax.walk_tuning import best_set
 from hector_jax.walk_tuning.campaign import Campaign
 from hector_jax.walk_tuning.walks import tune_on_walks
 
-_LIMIT = 600.0  # [s] of the calls of a log
-
 
 def run_check(args: Check) -> None:
     """Say what of a log no weights can mend."""
@@ -58,10 +56,9 @@ def run_twin(args: Twin) -> None:
     walk, end = read_walk(args.log, robot, seconds, config.gait.tick)
     weights = arguments.weights_by_name(args.weights, robot)
     calls = None
-    if args.planner:
+    if planner := arguments.planner_of(args):
         ticks = trajectory_of(at_ticks(log_of(walk), config.gait.tick))
         inputs = plan_inputs(config, robot, weights, trajectory.command, ticks)
-        planner = program_of(args.planner, _LIMIT)
         calls = compare_calls(planner, config, robot, inputs, ticks)
         parity = calls.parity
     else:
@@ -149,7 +146,7 @@ def tune_walker(folder: Path, args: Tune) -> None:
         commands,
         best_set.walk_plants(robot, args.walk_plants, args.walks, len(commands))[0],
         arguments.engine_of(args),
-        args.planner and program_of(args.planner, args.walker_limit, args.walker_uses),
+        arguments.planner_of(args),
     )
     _check_first(args, campaign, seconds)
     with workers(args.processes, args.cluster) as pool:
@@ -165,6 +162,9 @@ def tune_walker(folder: Path, args: Tune) -> None:
         drawn = arguments.plants("standin", seeds, robot.description)
         title, inputs = f"evaluating on {plural(len(seeds), 'plant')}", (drawn, seeds)
         judged = judging.judge(setup, compared, commands, *inputs, title=title, **options)
+    first = tuned.sets[0].losses.reshape(len(campaign.plants), -1)
+    if len(first) > 1 and np.ptp(first, axis=0).max() == 0.0:
+        say(f"the walks of {args.walker} do not depend on `plant`: --walk-plants 1 tells as much")
     verdict = judged.verdict
     result = {**metrics.verdict_result({"standin": verdict}), "walks": tuned.rows}
     write_json(folder / RESULT, result)
