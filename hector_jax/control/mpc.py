@@ -104,11 +104,11 @@ class MpcConfig:
 
     def parameters(self, weights: Weights) -> MpcParameters:
         """Return the traced numbers."""
-        gains = self.horizontal_gain, self.height_gain, self.tilt_gain, self.yaw_gain
+        gains = IntegralGains(self.horizontal_gain, self.height_gain, self.tilt_gain, self.yaw_gain)
         limit = math.inf if self.position_limit is None else self.position_limit
-        numbers = self.friction, self.max_force, float(self.effort_reference == "gravity"), limit
+        effort = float(self.effort_reference == "gravity")
         costs = {str(cost): 1.0 for cost in self.costs}
-        return MpcParameters(weights, *numbers, IntegralGains(*gains), costs)
+        return MpcParameters(weights, self.friction, self.max_force, effort, limit, gains, costs)
 
     def planned_inertia(self, inertia: Float[Any, "3 3"]) -> Float[Any, "3 3"]:
         """Return the inertia [kg m^2] that the plan turns, from that of the whole robot."""
@@ -292,8 +292,8 @@ def _on_contacts(
     robot = robot._replace(half_width=config.sole_width * robot.half_width)
 
     def of_contact(yaw: Float[Array, ""], max_force: Float[Array, ""]) -> tuple[Array, ...]:
-        framed = config.contact.in_frame(yaw, horizon.frame)
-        contact = Contact(*framed, robot, parameters.friction, max_force, config.twist)
+        force, moment, yaw = config.contact.in_frame(yaw, horizon.frame)
+        contact = Contact(force, moment, yaw, robot, parameters.friction, max_force, config.twist)
         each = [rows(part, contact, feet) for part in parts]
         return tuple(map(jnp.concatenate, zip(*each, strict=True)))
 
@@ -379,8 +379,8 @@ def build_qp(
     q = half_slope(config, problem, condensed, jnp.zeros_like(condensed.push[:, 0]))
     A, lower, upper = input_rows(config, problem, condensed)
     if config.on("states"):
-        parts = Rows(block_diagonal(A), lower, upper), state_rows(config, problem, condensed)
-        A, lower, upper = map(jnp.concatenate, zip(*parts, strict=True))
+        of_u, of_x = Rows(block_diagonal(A), lower, upper), state_rows(config, problem, condensed)
+        A, lower, upper = map(jnp.concatenate, zip(of_u, of_x, strict=True))
     return QP(2.0 * P, 2.0 * q.reshape(-1), A, lower, upper), condensed
 
 

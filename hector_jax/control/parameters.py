@@ -244,8 +244,8 @@ def weights_after(
     start: Weights, steps: Float[Array | np.ndarray, " n"], others: Sequence[str] = ()
 ) -> Weights:
     """Return the weights of `stepped`, clipped to the box against rounding of the logarithm."""
-    limits = bounds(start.others, start)
-    return jax.tree.map(jnp.clip, stepped(start, steps, others), *limits)
+    lower, upper = bounds(start.others, start)
+    return jax.tree.map(jnp.clip, stepped(start, steps, others), lower, upper)
 
 
 def gradient_by_steps(

@@ -36,9 +36,9 @@ def with_pieces(command: Command) -> Command:
     Pieces without duration are added at its end.
     """
     added = max(PIECES - len(command.duration), 0)
-    duration, *rest = (np.concatenate([x, np.repeat(x[-1:], added, axis=0)]) for x in command)
-    duration[len(duration) - added :] = 0.0
-    return Command(duration, *rest)
+    padded = jax.tree.map(lambda x: np.concatenate([x, np.repeat(x[-1:], added, axis=0)]), command)
+    padded.duration[len(command.duration) :] = 0.0
+    return padded
 
 
 class Anchor(NamedTuple):

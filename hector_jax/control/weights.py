@@ -101,10 +101,10 @@ def vector_to_weights(
     """Return weights from a vector of `weights_to_vector`, shaped like `like`, default HECTOR's."""
     R = (nominal() if like is None else like).R
     ends = np.cumsum([3, 3, 3, 3, *(int(np.prod(w.shape[-2:])) for w in R)])[:-1]
-    *Q, force, moment = jnp.split(vector, ends, axis=-1)
+    euler, position, ang_velocity, velocity, force, moment = jnp.split(vector, ends, axis=-1)
     pairs = zip((force, moment), R, strict=True)
     R = Wrench(*(x.reshape(*x.shape[:-1], *w.shape[-2:]) for x, w in pairs))
-    return Weights(State(*Q), R)
+    return Weights(State(euler, position, ang_velocity, velocity), R)
 
 
 def directions(like: Weights | None = None) -> Float[np.ndarray, "directions weights"]:

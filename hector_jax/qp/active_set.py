@@ -170,8 +170,10 @@ def first_guess(tolerances: Tolerances, qp: Normal) -> Start:
         residuals = qp.residuals(point)
         found = point, jnp.stack([side > 0, side < 0]), residuals
         nothing = jax.tree.map(jnp.zeros_like, point), jnp.zeros_like(qp.side), infinite
-        found = where((settled > 0) & jnp.all(jnp.isfinite(residuals)), found, nothing)
-        return Start(*found, definite > 0, definite > 0)  # if not proved, `method` factorises P
+        sound = (settled > 0) & jnp.all(jnp.isfinite(residuals))
+        point, active, residuals = where(sound, found, nothing)
+        # if not proved, `method` factorises P
+        return Start(point, active, residuals, definite > 0, definite > 0)
 
     if jax.default_backend() != "gpu":
         return violated(qp)

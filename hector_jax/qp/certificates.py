@@ -38,8 +38,8 @@ def curvature(tolerances: Tolerances, qp: Normal) -> tuple[Array, Array, Array]:
     return x, definite, convex
 
 
-def only_if(enabled: Array, function: Callable, otherwise: Any, operands: Any) -> Any:
-    """Return `function(operands)` if `enabled`, else `otherwise`, at no cost if none is enabled.
+def only_if(enabled: Array, function: Callable, otherwise: Any, *operands: Any) -> Any:
+    """Return `function(*operands)` if `enabled`, else `otherwise`, at no cost if none is enabled.
 
     This is a loop of one iteration, because under vmap a cond computes both branches.
     """
@@ -47,7 +47,7 @@ def only_if(enabled: Array, function: Callable, otherwise: Any, operands: Any) -
     def once(state: tuple) -> tuple:
         # depend on the state, otherwise the compiler moves the computation out of the loop
         _, hidden = lax.optimization_barrier((state[0], operands))
-        return jnp.zeros((), bool), function(hidden)
+        return jnp.zeros((), bool), function(*hidden)
 
     return lax.while_loop(lambda state: state[0], once, (enabled, otherwise))[1]
 

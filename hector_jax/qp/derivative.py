@@ -85,7 +85,7 @@ def _jvp(config: QpConfig, primals: tuple, tangents: tuple) -> tuple[Solution, S
     tolerances = config.tolerances(dtype)
     column, row = normal.column, normal.row
     weight = jnp.sum(ratio, axis=0)  # XLA repeats ratio[0] + ratio[1] in each use, a reduction not
-    weight = _once.bind(weight, *at)
+    weight = _once.bind(weight, at.slope, at.rows, at.l, at.u)
     capped = weight >= tolerances.cap
     solved = solution.status == Status.SOLVED
     shift = weight * d.rows - ratio[0] * d.u - ratio[1] * d.l

@@ -89,14 +89,14 @@ def guess(
         interpret: interpret the kernel's operations on any device; for tests.
     """
     options: Any = {}
-    flag, side = (jax.ShapeDtypeStruct(shape, jnp.int32) for shape in ((), lower.shape))
-    x, y = (jax.ShapeDtypeStruct(v.shape, q.dtype) for v in (q, lower))
-    out: Any = x, y, side, flag, flag
+    shaped: Any = jax.ShapeDtypeStruct
+    flag, side = (shaped(shape, jnp.int32) for shape in ((), lower.shape))
+    x, y = (shaped(v.shape, q.dtype) for v in (q, lower))
     if not interpret:
         options["compiler_params"] = triton.CompilerParams(num_warps=4, num_stages=1)
     return pl.pallas_call(
         partial(_kernel, A.shape, curvature, (lambda: None) if interpret else triton.debug_barrier),
-        out_shape=Guess(*out),
+        out_shape=Guess(x, y, side, flag, flag),
         interpret=interpret,
         **options,
     )(P, q, A.ravel(), lower, upper)

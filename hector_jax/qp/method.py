@@ -135,12 +135,13 @@ def _solve_rounds(
         exact, exact_residuals, iterations = active_set(
             tolerances, qp, begin, active=sides, enabled=solvable, limit=limit
         )
-        best = state.point, state.residuals
-        for candidate in ((near.point, near.residuals), (exact, exact_residuals)):
-            best = where(jnp.max(candidate[1]) < jnp.max(best[1]), candidate, best)
+        point, residuals = state.point, state.residuals
+        for other in ((near.point, near.residuals), (exact, exact_residuals)):
+            better = jnp.max(other[1]) < jnp.max(residuals)
+            point, residuals = where(better, other, (point, residuals))
         iterations = state.iterations + near.iterations + iterations
-        running = ~state.approached & (jnp.max(best[1]) > tolerances.target)
-        return _Best(*best, near.certified, iterations, jnp.ones((), bool), running)
+        running = ~state.approached & (jnp.max(residuals) > tolerances.target)
+        return _Best(point, residuals, near.certified, iterations, jnp.ones((), bool), running)
 
     return lax.while_loop(lambda state: state.running, attempt, first)
 
@@ -170,21 +171,20 @@ def _decide(
         first = first._replace(running=first.running & start.convex)
         best = _solve_rounds(config, tolerances, qp, first, start.active)
         solved = valid & (jnp.max(best.residuals) <= tolerances.residual)
-        test = lambda operands: is_unique(tolerances, *operands)  # noqa: E731
-        unique = only_if(solved & ~start.definite, test, start.definite, (qp, best.point))
+        test = partial(is_unique, tolerances)
+        unique = only_if(solved & ~start.definite, test, start.definite, qp, best.point)
         return best, start.convex, unique
 
     if jax.default_backend() != "gpu":
         return settle(qp, first, start)
 
-    def prove(operands: tuple[Normal, _Best, Start]) -> tuple[_Best, Array, Array]:
-        qp, first, start = operands
+    def prove(qp: Normal, first: _Best, start: Start) -> tuple[_Best, Array, Array]:
         signs = lambda qp: curvature(tolerances, qp)[1:]  # noqa: E731
         definite, convex = only_if(~start.definite, signs, (start.definite, start.convex), qp)
         return settle(qp, first, start._replace(definite=definite, convex=convex))
 
     as_guessed = first, start.convex, start.definite
-    return only_if(valid & (unsolved | ~start.definite), prove, as_guessed, (qp, first, start))
+    return only_if(valid & (unsolved | ~start.definite), prove, as_guessed, qp, first, start)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -195,8 +195,8 @@ def solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, Normal]:
     vectors = jnp.isfinite(qp.q) & jnp.isfinite(jnp.diagonal(qp.P))
     valid = jnp.all(vectors) & jnp.all(jnp.isfinite(qp.A)) & ~jnp.any(no_bound)
     # zeros replace invalid data, so that no NaN reaches the solver; a P with one is not convex
-    rest = where(valid, qp[1:], jax.tree.map(jnp.zeros_like, qp[1:]))
-    normal = normalise(tolerances, QP(qp.P, *rest))
+    q, A, lower, upper = where(valid, qp[1:], jax.tree.map(jnp.zeros_like, qp[1:]))
+    normal = normalise(tolerances, QP(qp.P, q, A, lower, upper))
     best, convex, unique = _decide(config, tolerances, normal, valid)
     valid &= convex
     # without a solution (infeasible, unbounded) residuals and x may be infinite
