@@ -102,10 +102,10 @@ def short_names(texts: Sequence[str]) -> dict[str, str]:
     return names
 
 
-def print_result(json: bool, result: Any, print_text: Callable[[], None], **options: Any) -> None:
+def print_result(json: bool, result: Any, print_text: Callable[[], None]) -> None:
     """Print the result of a command: as JSON if --json is set, else as text."""
     if json:
-        print(as_json(result, **options))
+        print(as_json(result))
     else:
         print_text()
 

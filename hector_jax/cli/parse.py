@@ -105,7 +105,7 @@ def from_line(words: Sequence[str]) -> Any:
     if rest[:1] == [_COMPLETION]:
         return _all_commands(words)
     if not rest or (len(rest) == 1 and rest[0] in _GROUPS):
-        print(overview(*rest))
+        print(overview("".join(rest)))
         raise SystemExit(0)
     name = _command(rest)
     return read_flags(COMMANDS[name], [*rest[name.count(" ") + 1 :], *helps], f"hector {name}")
@@ -114,7 +114,7 @@ def from_line(words: Sequence[str]) -> Any:
 def read_flags(kind: type[Flags], words: Sequence[str], program: str) -> Flags:
     """Read the flags of a program from the words after its name; see `from_line`."""
     helps = [word for word in words if word in _HELP]
-    options: dict[str, Any] = {"prog": program}
+    default: Any = tyro.MISSING_NONPROP
     words = [word for word in words if word not in _HELP]
     names = [word[2:].partition("=")[0].replace("_", "-") for word in words if word[:2] == "--"]
     given = [name.removeprefix("no-") for name in names]
@@ -122,27 +122,27 @@ def read_flags(kind: type[Flags], words: Sequence[str], program: str) -> Flags:
         if given.count(name) > 1:
             raise InputError(f"--{name} is given twice")
     if "config" in given:
-        flags_of_line: Any = _quietly(kind, words, **options)
-        options["default"] = default = from_file(kind, flags_of_line.config)
+        flags_of_line: Any = _quietly(kind, words, program, default)
+        default = from_file(kind, flags_of_line.config)
         given += getattr(default, "given", ())
     if helps:
-        return _print_help(kind, _ALL in helps, **options)
-    return with_given(_quietly(kind, words, **options), (x.replace("-", "_") for x in given))
+        return _print_help(kind, _ALL in helps, program, default)
+    return with_given(_quietly(kind, words, program, default), (x.replace("-", "_") for x in given))
 
 
-def _print_help(kind: Any, whole: bool, **options: Any) -> Any:
+def _print_help(kind: Any, whole: bool, prog: str, default: Any) -> Any:
     """Print the help of a command, of its usual flags or of all; exits by SystemExit."""
     if whole or not kind.usual:
-        return _tyro(kind, ["--help"], **options)
+        return _tyro(kind, ["--help"], prog=prog, default=default)
     text, shown = io.StringIO(), True
     with redirect_stdout(text), suppress(SystemExit):
-        _tyro(kind, ["--help"], **options)
+        _tyro(kind, ["--help"], prog=prog, default=default)
     for line in text.getvalue().splitlines():
         if flag := re.match(r"  --(\w[\w-]*)", line):  # what follows belongs to it
             shown = flag[1].replace("-", "_") in kind.usual
         if shown and line.strip():
             print(line.rstrip())
-    print(f"{len(fields(kind)) - len(kind.usual)} more flags: {options['prog']} {_ALL}")
+    print(f"{len(fields(kind)) - len(kind.usual)} more flags: {prog} {_ALL}")
     raise SystemExit(0)
 
 
@@ -172,19 +172,19 @@ def _all_commands(words: Sequence[str]) -> Any:
     return _tyro(union(""), words, prog="hector")
 
 
-def _quietly(kind: type, words: Sequence[str], **options: Any) -> Any:
+def _quietly(kind: type, words: Sequence[str], prog: str, default: Any) -> Any:
     """Parse; raise an InputError of one line where tyro would print a box."""
     text = io.StringIO()
     try:
         with redirect_stdout(text), redirect_stderr(text):
-            flags, rest = _tyro(kind, words, return_unknown_args=True, **options)
+            flags, rest = _tyro(kind, words, prog=prog, default=default, return_unknown_args=True)
     except SystemExit:
         title, *body = re.split(r"\n\s*-{5,}\s*\n", text.getvalue())
         raise InputError(one_line(body[0] if body else title)) from None
     if not rest:
         return flags
-    name = options["prog"].removeprefix("hector ")
-    help_line = f"; see {options['prog']} {_ALL if kind.usual else '--help'}"
+    name = prog.removeprefix("hector ")
+    help_line = f"; see {prog} {_ALL if kind.usual else '--help'}"
     if not rest[0].startswith("--"):
         raise InputError(f"{name} does not expect {short_repr(rest[0])}{help_line}")
     flag = rest[0].partition("=")[0]

@@ -105,11 +105,11 @@ class _Tried(NamedTuple):
     by_leg: Float[np.ndarray, "n feet j"]
     R: Float[np.ndarray, "n 3 3"]
 
-    def stand(self, by_leg: np.ndarray | None = None, **changed: np.ndarray) -> Stand:
-        """Return how the feet stand with other joints, `R` or `stance`."""
-        log = self._replace(by_leg=self.by_leg if by_leg is None else by_leg, **changed)
-        soles = np.asarray(_soles(log.robot, log.by_leg.reshape(len(log.R), -1)))
-        return _stand(soles, log.R, log.walk.state.position, log.stance, float(log.walk.period))
+    def stand(self, by_leg: np.ndarray | None = None) -> Stand:
+        """Return how the feet stand, with other joints if they are given."""
+        by_leg = self.by_leg if by_leg is None else by_leg
+        soles = np.asarray(_soles(self.robot, by_leg.reshape(len(self.R), -1)))
+        return _stand(soles, self.R, self.walk.state.position, self.stance, float(self.walk.period))
 
 
 def _in_a_leg(log: _Tried) -> Iterator[LogChange]:
@@ -147,7 +147,7 @@ def _of_legs(log: _Tried) -> Iterator[LogChange]:
             by_leg, source = log.by_leg.copy(), (foot + k) % legs
             by_leg[:, :, columns] = log.by_leg[:, source, columns]
             stance = log.stance[:, source] if forces else log.stance
-            table[:, foot, source] = log.stand(by_leg, stance=stance)
+            table[:, foot, source] = log._replace(stance=stance).stand(by_leg)
         return table
 
     pairs = np.arange(legs).reshape(-1, 2)[:, ::-1].ravel()
@@ -172,7 +172,7 @@ def _of_time_and_angles(log: _Tried) -> Iterator[LogChange]:
     state, period = log.walk.state, float(log.walk.period)
     every = np.ones(log.by_leg.shape[1], bool)
     R = np.asarray(jax.vmap(rotation_from_euler)(state.euler[:, ::-1]))
-    yield LogChange("the angles are yaw, pitch, roll", every, log.stand(R=R))
+    yield LogChange("the angles are yaw, pitch, roll", every, log._replace(R=R).stand())
     soles = np.asarray(_soles(log.robot, log.by_leg.reshape(len(log.R), -1)))
     step = max(round(SHIFT / period), 1)
     for n in range(step, round(LATEST / period) + 1, step):
