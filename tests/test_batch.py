@@ -61,7 +61,7 @@ def toy_matrix(config, scenario, weights, loss, *, walk=None, others=()):
     return 3.0 * loss[0].weight * (2.0 * shared @ shared.T + along)
 
 
-def toy_slope(config, scenario, weights, loss, *, walk, others):
+def toy_slope(config, scenario, weights, loss, *, others, walk=None):
     seen = toy(config, scenario, weights, loss)
     return seen, toy_matrix(config, scenario, weights, loss, others=others)
 

@@ -143,8 +143,8 @@ def _evaluate(
         return found._replace(loss=value, terms=terms, gradient=gradient)
 
     def curvature(scenario: Scenario, loss: Loss, scale: Array) -> Array:
-        inputs = config.rollout, scenario, weights, loss
-        return least_squares(*inputs, walk=walk, others=config.others)[1] / scale
+        rollout, others = config.rollout, config.others
+        return least_squares(rollout, scenario, weights, loss, walk=walk, others=others)[1] / scale
 
     stacked = over_scenarios(value)
     weighted_sum = partial(jnp.tensordot, tail_weights(stacked.loss, problem.tail), axes=1)

@@ -87,8 +87,8 @@ def least_squares(
 
     J, (r, trajectory) = jax.jacfwd(rows, has_aux=True)(zero)
     gradient = gradient_by_weights(weights, 2.0 * r @ J, others)
-    checks = jnp.mean(1.0 * trajectory.fallen), jnp.max(trajectory.residual)
-    found = Evaluation(r @ r, losses(loss, trajectory), gradient, *checks)
+    fallen, residual = jnp.mean(1.0 * trajectory.fallen), jnp.max(trajectory.residual)
+    found = Evaluation(r @ r, losses(loss, trajectory), gradient, fallen, residual)
     return found, 2.0 * J.T @ J
 
 

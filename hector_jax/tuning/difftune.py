@@ -37,7 +37,7 @@ from hector_jax.tuning import step_rules
 from hector_jax.tuning.curvature import least_squares_jit
 from hector_jax.tuning.evaluate import Evaluation, Objective, evaluate_jit
 from hector_jax.tuning.loss import PAPER_LOSS, alphas, check_loss
-from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
+from hector_jax.tuning.rollout import RolloutConfig, Scenario
 from hector_jax.tuning.status import StepStatus, Stop, status_text
 from hector_jax.tuning.step_rules import StepState
 
@@ -177,8 +177,7 @@ def model_slope(
     """
     if config.rule != "gauss_newton":
         return tune_step(config, scenario, weights), None
-    inputs = config.rollout, scenario, weights, config.loss
-    return least_squares_jit(*inputs, walk=rollout, others=config.others)
+    return least_squares_jit(config.rollout, scenario, weights, config.loss, others=config.others)
 
 
 def step_rule(config: TuneConfig, start: Weights) -> optax.GradientTransformationExtraArgs:
@@ -262,11 +261,11 @@ def update(
     value = jnp.where(usable, evaluation.loss, jnp.inf)
     rule, trial = step_rule(config, state.start), trial_weights(config, state)
     gradient = parameters.gradient_by_steps(trial, evaluation.gradient, config.others)
-    box = parameters.step_bounds(state.start, config.others)
+    box = low, high = parameters.step_bounds(state.start, config.others)
     given = {"value": value, "matrix": matrix, "box": box}
     updates, after = rule.update(gradient, state.rule, state.steps, **given)
     after = cast(StepState, after)
-    steps = optax.projections.projection_box(optax.apply_updates(state.steps, updates), *box)
+    steps = optax.projections.projection_box(optax.apply_updates(state.steps, updates), low, high)
 
     stop = jnp.where(iteration >= config.iterations, Stop.LIMIT, Stop.GOING)
     if config.rule == "gauss_newton":

@@ -12,6 +12,7 @@ from hector_jax.control.weights import Weights, weights_to_vector
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError, unknown
 from hector_jax.core.trajectory import Trajectory
+from hector_jax.core.tree import stack
 from hector_jax.tuning.loss import Loss, Terms, losses, total, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
@@ -83,7 +84,7 @@ def mean_objective(
     def mean(trees: Sequence[Any]) -> Any:
         scales = np.ones(len(trees)) if losses is None else losses / losses.mean()
         scaled = [jax.tree.map(lambda x, k=k: x / k, t) for t, k in zip(trees, scales, strict=True)]
-        return jax.tree.map(lambda *values: np.mean(values, axis=0), *scaled)
+        return jax.tree.map(lambda x: np.mean(x, axis=0), stack(scaled))
 
     def slope(weights: Weights) -> tuple[Evaluation, Any]:
         found = jax.device_get(slopes(weights))

@@ -45,7 +45,8 @@ def carry_from(
     measured: MeasuredState, anchor: Anchor, commands: Wrench, disturbance: Disturbance
 ) -> Carry:
     """Return the carry of a robot that has not fallen, from its measured state."""
-    return Carry(*measured, commands, anchor, disturbance, fallen=jnp.asarray(False))
+    state, feet = measured
+    return Carry(state, feet, commands, anchor, disturbance, fallen=jnp.asarray(False))
 
 
 class Grounding(NamedTuple):
@@ -113,19 +114,19 @@ def fit_grounding(
     ends = measured_states(robot, *jax.tree.map(lambda x: x[1:], (walk.state, walk.joints)))
 
     def step(memory: tuple[Wrench, Disturbance], inputs: tuple) -> tuple[tuple, MeasuredState]:
-        begin, end, error, tick, row = inputs
-        carry = carry_from(begin, anchor, *memory)
+        (commands, disturbance), (begin, end, error, tick, row) = memory, inputs
+        carry = carry_from(begin, anchor, commands, disturbance)
         planner = _planner(row, carry, weights, weights)
-        options = {"error": error, "planner": planner}
-        after, _ = step_carry(config, scenario, weights, carry, tick, **options)
+        after, _ = step_carry(config, scenario, weights, carry, tick, error=error, planner=planner)
         residual = jax.tree.map(jnp.subtract, end, MeasuredState(after.state, after.feet))
         return (after.commands, after.disturbance), _turned(residual, -begin.state.euler[2])
 
     disturbance = jax.tree.map(lambda x: x[0], belief.disturbance)
-    memory = command_history(command_before), disturbance
-    ticks = tick + jnp.arange(len(ends.feet.yaw))
-    _, residuals = jax.lax.scan(step, memory, (begins, ends, errors, ticks, called))
-    start, scenario = carry_from(first, anchor, *memory), scenario._replace(anchor=anchor)
+    commands, ticks = command_history(command_before), tick + jnp.arange(len(ends.feet.yaw))
+    memory, rows = (commands, disturbance), (begins, ends, errors, ticks, called)
+    _, residuals = jax.lax.scan(step, memory, rows)
+    start = carry_from(first, anchor, commands, disturbance)
+    scenario = scenario._replace(anchor=anchor)
     return Grounding(scenario, start, tick, errors, residuals, weights, called)
 
 

@@ -61,7 +61,7 @@ class LossTerm(NamedTuple):
 jax.tree_util.register_pytree_node(
     LossTerm,
     lambda term: ((term.weight,), (term.name, term.unit, term.of)),
-    lambda static, weight: LossTerm(*static[:2], *weight, static[2]),
+    lambda static, weight: LossTerm(static[0], static[1], weight[0], static[2]),
 )
 
 Loss = tuple[LossTerm, ...]
