@@ -56,9 +56,9 @@ def bar(title: str) -> Iterator[ReportProgress]:
         Function of the number done, the total and a short remark.
     """
     if console.is_terminal:
-        done, times = MofNCompleteColumn(), (TimeElapsedColumn(), "left", TimeRemainingColumn())
-        columns = "{task.description}", BarColumn(), done, *times, "{task.fields[remark]}"
-        with Progress(*columns, console=console) as progress:
+        head, end = "{task.description}", "{task.fields[remark]}"
+        done, past, eta = MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
+        with Progress(head, BarColumn(), done, past, "left", eta, end, console=console) as progress:
             task = progress.add_task(title, total=None, remark="")
             yield lambda done, total, remark="": progress.update(
                 task, completed=done, total=total, remark=remark

@@ -248,8 +248,7 @@ def _fit_legs(
             by_pair = x.reshape(*sign.shape, -1)
             return np.einsum("nps,npsi->nip", sign, by_pair).reshape(len(x), -1)
 
-        columns = sum_pairs(tick_by_foot), sum_pairs(gated)
-        bias, slope = _ridge(RIDGE_MOTION, *columns, load[:, axes])
+        bias, slope = _ridge(RIDGE_MOTION, sum_pairs(tick_by_foot), sum_pairs(gated), load[:, axes])
         legs_bias[..., axes] = bias.reshape(*legs_bias.shape[:2], -1)
         legs[..., axes] = slope.reshape(*legs.shape[:3], -1)
     legs /= term_scale[:, None, None]

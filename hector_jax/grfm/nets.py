@@ -188,7 +188,7 @@ def fit_nets(
     infinite = jnp.full(len(jax.tree.leaves(nets)[0]), jnp.inf, jnp.float32)
     # traced: another rate needs no new compilation
     rates, rows = (config.learning_rate, config.l2), []
-    optimiser = _optimiser(*rates)
+    optimiser = _optimiser(rates)
     carries = [_Carry(net, optimiser.init(net), net, infinite) for net in nets]
 
     def train(kind: int, key: Key[Array, ""]) -> Float[np.ndarray, "2"]:
@@ -219,7 +219,9 @@ def _of_kind(samples: Samples, kind: int) -> Samples:
     return samples._replace(x=samples.x[kind], y=samples.y[kind])
 
 
-def _optimiser(learning_rate: Any, l2: Any) -> optax.GradientTransformation:
+def _optimiser(rates: tuple[Any, Any]) -> optax.GradientTransformation:
+    learning_rate, l2 = rates
+
     def kernels(nets: Any) -> Any:
         return jax.tree_util.tree_map_with_path(lambda path, _: path[-1].key == "kernel", nets)
 
@@ -254,7 +256,7 @@ def _train_epoch(
     count = len(training.x)
     batch = min(size, count)
     order = jax.random.permutation(key, count)[: count // batch * batch].reshape(-1, batch)
-    optimiser = _optimiser(*rates)
+    optimiser = _optimiser(rates)
 
     def loss(nets: Any, samples: Samples) -> tuple[Float[Array, ""], Array]:
         squares = _squares(output, nets, samples)

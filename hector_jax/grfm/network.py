@@ -85,8 +85,8 @@ def load_net(
 
 def empty_params(variant: str, hidden: tuple[int, ...], config: WalkConfig) -> Params:
     """Return zeros in the parameters' shapes, as `load_tree` takes them; an axis of 0 is ticks."""
-    sizes = len(config.gait.offsets), config.mpc.contact.axes
-    shapes = _shapes(VARIANTS[variant], hidden, *sizes, jnp.result_type(float))
+    feet, axes = len(config.gait.offsets), config.mpc.contact.axes
+    shapes = _shapes(VARIANTS[variant], hidden, feet, axes, jnp.result_type(float))
     return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
 
 

@@ -53,10 +53,10 @@ def init(
     """Draw networks without statistics, in 32 bits; the axis of ticks has length 0."""
     terms = num_changes(feet, axes) + MOTION
     inputs = terms + len(GATES) + feet - 1
-    drawn = nets.init_nets(key, hidden, inputs, outputs=3, members=MEMBERS, axes=axes)
+    force, moment = nets.init_nets(key, hidden, inputs, outputs=3, members=MEMBERS, axes=axes)
     table = jnp.zeros((feet, 0, terms))
     stats = FeatureStats(table, table, jnp.zeros(()))
-    params = ResidualParams(gated.init(key, feet, axes), *drawn, stats, jnp.zeros(axes))
+    params = ResidualParams(gated.init(key, feet, axes), force, moment, stats, jnp.zeros(axes))
     return jax.tree.map(lambda p: jnp.asarray(p, jnp.float32), params)
 
 

@@ -182,7 +182,7 @@ def _legs(path: Path, data: mujoco.MjData, free: Sequence[int]) -> tuple[tuple[i
     expect(path, len(legs) <= 2 and len(set(counts)) == 1, text)
     legs.sort(key=lambda pair: -data.xanchor[hip(data, pair[0])][0])
     for pair in legs:
-        if _is_right(data, *pair):
+        if _is_right(data, pair):
             pair.reverse()
     return tuple(sum(legs, []))
 
@@ -198,13 +198,13 @@ def _offsets(
     return np.linalg.norm(offset - along[:, None] * axes, axis=1)
 
 
-def _is_right(data: mujoco.MjData, leg: Sequence[int], other: Sequence[int]) -> bool:
-    """Return whether a leg is the right one of a pair."""
-    of_leg, of_other = (data.subtree_com[_body(data.model, x[0])] for x in (leg, other))
+def _is_right(data: mujoco.MjData, pair: Sequence[Sequence[int]]) -> bool:
+    """Return whether the first leg of a pair is the right one."""
+    of_leg, of_other = (data.subtree_com[_body(data.model, leg[0])] for leg in pair)
     y = of_leg[1] - of_other[1]
     if abs(y) > 1e-3:
         return bool(y < 0.0)
-    return "right" in places_of([data.model.joint(leg[0]).name])
+    return "right" in places_of([data.model.joint(pair[0][0]).name])
 
 
 def _knee(path: Path, data: mujoco.MjData, leg: Sequence[int]) -> int:

@@ -54,7 +54,7 @@ def claims(cells: Cells, differs: Mapping[str, str], world: str) -> dict[str, li
     pairs = [(n, b) for n in names for b in BASELINES if b in names and b != n]
     pairs = [(n, b) for n, b in pairs if n not in BASELINES] or pairs[-1:]
     seeds = {column: verdict.seeds for (column, _), verdict in cells.items()}
-    changes = {pair: matrix.changes_by_cell(cells, *pair) for pair in pairs}
+    changes = {(n, b): matrix.changes_by_cell(cells, n, b) for n, b in pairs}
     fill = partial(
         render,
         matrix=matrix,
@@ -114,7 +114,7 @@ def print_matrix(cells: Cells, lines: Iterable[str]) -> None:
             text = change_text(compare(verdict, name, baseline), void=" *")
             texts.append(f"{name} {text}" + f" ({plural(falls, 'fall')})" * bool(falls))
         print(f"{cell_text(cell):32s} {'   '.join(texts)}")
-    print(*lines, sep="\n")
+    print("\n".join(lines))
 
 
 def matrix_report(cells: Cells, differs: Mapping[str, str], world: str) -> dict[str, Any]:

@@ -194,11 +194,11 @@ def _terminal_table(verdict: Verdict, padding: int) -> Table:
         table.add_column(Text(head), justify="right", no_wrap=True)  # [cm] is no markup
     for name, summary in summaries(verdict).items():
         at = plain_errors(verdict, name)
-        means = [number(at[error], ".1f") for error in ("plane", "height", "pitch")]
-        means.append(loss.text(summary.means["L"].value))
-        falls = Text(str(summary.falls), style="red" if summary.falls else "")
-        changes = [_change(summary.against.get(baseline)) for baseline in others]
-        table.add_row(name, *means, falls, *changes)
+        cells: list[Any] = [number(at[error], ".1f") for error in ("plane", "height", "pitch")]
+        cells.append(loss.text(summary.means["L"].value))
+        cells.append(Text(str(summary.falls), style="red" if summary.falls else ""))
+        cells += [_change(summary.against.get(baseline)) for baseline in others]
+        table.add_row(name, *cells)
     return table
 
 

@@ -153,8 +153,8 @@ def _leg_constants(robot: Robot) -> _Leg:
     """Return the constants of all legs."""
     parts = (robot.joint_origin, robot.joint_axis, robot.foot_point, robot.sole)
     limits = (robot.joint_lower, robot.joint_upper, robot.standing_joints)
-    by_leg = (jnp.asarray(x).reshape(len(robot.foot_point), -1) for x in limits)
-    return _Leg(*map(jnp.asarray, parts), *by_leg)
+    lower, upper, standing = (jnp.asarray(x).reshape(len(robot.foot_point), -1) for x in limits)
+    return _Leg(*map(jnp.asarray, parts), lower=lower, upper=upper, standing=standing)
 
 
 def _chain(robot: Robot, joints: Float[Array, " joints"]) -> _Chain:
@@ -251,10 +251,10 @@ def _newton_inverse(
     rows = np.array(placed)
 
     def error(
-        joints: Array, position: Array, yaw: Array, up: Array
+        joints: Array, target: tuple[Array, Array, Array]
     ) -> tuple[Float[Array, " rows"], Float[Array, "rows j"]]:
         """Return the error of foot point [m] and sole [rad] in the rows, and its Jacobian."""
-        chain = _general_chain(leg, joints)
+        chain, (position, yaw, up) = _general_chain(leg, joints), target
         pitch = jnp.arctan2(-up[0], jnp.hypot(up[1], up[2]))
         to_target = rot_z(yaw).T @ rot_y(pitch) @ rot_x(jnp.arctan2(up[1], up[2]))
         rotation = _rotation_vector(to_target @ chain.rotation)
@@ -263,9 +263,9 @@ def _newton_inverse(
         residual = jnp.concatenate([chain.foot - position, rotation])
         return residual[rows], jnp.concatenate([J_v, J_w])[rows]
 
-    def step(joints: Array, *target: Array) -> Array:
+    def step(joints: Array, target: tuple[Array, Array, Array]) -> Array:
         constant = jax.lax.stop_gradient(joints)
-        residual, J = error(constant, *target)
+        residual, J = error(constant, target)
         J = jax.lax.stop_gradient(J)
         damping = _DAMPING * jax.lax.stop_gradient(residual @ residual) + 1e-12
         damped = J @ J.T + damping * jnp.eye(len(rows), dtype=J.dtype)
@@ -273,14 +273,14 @@ def _newton_inverse(
         return rest - J.T @ _solve(damped, residual + J @ rest)
 
     def iterate(joints: Array, _: None) -> tuple[Array, None]:
-        joints = joints + jnp.clip(step(joints, *constant_target), -_MAX_STEP, _MAX_STEP)
+        joints = joints + jnp.clip(step(joints, constant_target), -_MAX_STEP, _MAX_STEP)
         return jnp.clip(joints, leg.lower, leg.upper), None
 
     target = (position, yaw, up)
     constant_target = jax.lax.stop_gradient(target)
     joints, _ = jax.lax.scan(iterate, jax.lax.stop_gradient(start), length=steps)
     # only this last step is differentiated: its derivative is that of the solution
-    return joints + step(joints, *target)
+    return joints + step(joints, target)
 
 
 def _solve(A: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -86,8 +86,8 @@ def links_of(
         parent = link_of.get(int(model.body_parentid[body]), -1)
         pose = frames[parent].to(frames[index]) if index else Pose()
         bodies = {b: frames[index].to(poses[b]) for b, link in link_of.items() if link == index}
-        properties = _composite(model, bodies)
-        links.append(Link(model.body(body).name, parent, joint, pose, *properties, bodies))
+        mass, com, inertia = _composite(model, bodies)
+        links.append(Link(model.body(body).name, parent, joint, pose, mass, com, inertia, bodies))
     return links
 
 

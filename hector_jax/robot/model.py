@@ -149,7 +149,7 @@ def _constants(description: Description, model: mujoco.MjModel, checked: bool) -
     points = np.array([data.site(foot.point).xpos for foot in description.named_feet])
     # in the standard form the first joint is the trunk's, and the others are those of the legs
     standing_joints, ranges = data.qpos[7:].copy(), model.jnt_range[1:]
-    bodies = model.body_mass, model.body_inertia, data.ximat.reshape(-1, 3, 3), data.xipos
+    R, centers = data.ximat.reshape(-1, 3, 3), data.xipos
     legs, spheres, radius = _legs(description, model)
     angles = standing_joints.reshape(len(spheres), -1)
     sole = np.stack([(R_wb @ R).T for R in map(_leg_rotation, legs["joint_axis"], angles)])
@@ -162,7 +162,7 @@ def _constants(description: Description, model: mujoco.MjModel, checked: bool) -
     contact = {1: "point", 2: "line", 4: "flat"}[contacts.shape[1]]
     robot = Robot(
         mass=model.body_subtreemass[trunk].copy(),
-        inertia=R_wb.T @ inertia_about(com, *bodies) @ R_wb,
+        inertia=R_wb.T @ inertia_about(com, model.body_mass, model.body_inertia, R, centers) @ R_wb,
         com_offset=R_wb.T @ (com - data.xpos[trunk]),
         gravity=0.0 - model.opt.gravity,
         sole=sole,

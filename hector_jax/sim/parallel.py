@@ -245,10 +245,10 @@ def _walk_one(
     program: _Program,
     robot: Robot,
     standing: tuple[mjx.Model, Float[Array, " nq"]],
-    job: Job,
-    varied: dict[str, Array],
+    batch: tuple[Job, dict[str, Array]],
 ) -> Trajectory:
-    model, qpos = standing[0].replace(**varied), standing[1]
+    (model, qpos), (job, varied) = standing, batch
+    model = model.replace(**varied)
     data = mjx.make_data(model)
     if program.single:
         model, data = mjx_model.to_single((model, data))
@@ -269,7 +269,7 @@ def _walk_one(
 
 @partial(jax.jit, static_argnames="program")
 def _walk_all(program, robot, standing, batch):
-    return jax.vmap(partial(_walk_one, program, robot, standing))(*batch)
+    return jax.vmap(partial(_walk_one, program, robot, standing))(batch)
 
 
 def _check_batch(jobs: Sequence[Job]) -> None:

@@ -199,12 +199,12 @@ class _Soles:
             G: Delassus matrix, velocities of the points per unit impulse at them [1/kg].
             free: velocities without impulses [m/s].
         """
-        cones, mean = self._cones[len(free) // 3], np.trace(G) / len(G)
+        (models, datas), mean = self._cones[len(free) // 3], np.trace(G) / len(G)
         result = pin.ADMMSolverResult()
         for share in _REGULARISATION:
             delassus = pin.DelassusOperatorDense(G + share * mean * np.eye(len(G)))
             result.reset()
-            if self._solver.solve(delassus, free, *cones, self._settings, result):
+            if self._solver.solve(delassus, free, models, datas, self._settings, result):
                 break
         residual = max(result.primal_feasibility, result.dual_feasibility, result.complementarity)
         return np.array(result.retrieveConstraintImpulses()), not residual < _MAX_RESIDUAL

@@ -139,12 +139,9 @@ def _torques(config: WalkConfig, *layouts: Layout) -> Callable[..., Array]:
         motors, torque = step_actuators(robot, imperfections, motors, torque)
         return pack((torque, yaw, motors))
 
-    def small_call(*packed: Array) -> Array:
-        with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
-            return jax.jit(torques)(*packed)
-
     if jax.default_backend() == "cpu":
-        compiled = jax.jit(small_call)
+        small = set_xla_metadata(xla_cpu_small_call="true", inlineable="false")
+        compiled = jax.jit(small(jax.jit(torques)))
         with suppress(jax.errors.JaxRuntimeError):
             compiled(*(np.zeros(sum(leaf.size for leaf in leaves)) for _, leaves in layouts))
             return compiled
@@ -246,8 +243,8 @@ def _simulate(
             yaw = np.asarray(packed_state)[joints]
             if plant.broken:
                 break  # rare: the samples of less than a block are another program
-        block = np.stack(inputs[begin // count :]), readings[begin : step + 1], plant.ground()
-        samples.append(jax.tree.map(np.asarray, sampled(packed_constants, *block)))
+        block, read = np.stack(inputs[begin // count :]), readings[begin : step + 1]
+        samples.append(jax.device_get(sampled(packed_constants, block, read, plant.ground())))
     assert planner is not None  # it has planned
     plan = unpack(planner.layout, np.stack(plans))[1]
     return plan, jax.tree.map(lambda *x: np.concatenate(x), *samples)

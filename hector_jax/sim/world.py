@@ -188,7 +188,7 @@ def hfs_with_motors(
             for choices.
     """
     rng = np.random.default_rng([0x4F6, round(1000 * share), seed])
-    delay, lag = (np.asarray(rng.uniform(*bounds)) for bounds in (MOTOR_DELAY, MOTOR_LAG))
+    delay, lag = (np.asarray(rng.uniform(a, b)) for a, b in (MOTOR_DELAY, MOTOR_LAG))
     return hfs_drawn(seed, share, description)._replace(delay=delay, lag=lag)
 
 
