@@ -568,13 +568,12 @@ def other_pages():
             cells.append(f"{sets(traj)['with']['change'][base]['median']:.0f}")
         yield DOCS / "paper.md", row(name, *cells)
 
-    own, away = report("own_controller.json"), []
-    changes = [one["best"]["standin"]["change"]["start"]["median"] for one in own["tuned"].values()]
-    for one in own["not tuned"].values():
-        L = {name: one[name]["standin"]["L"]["mean"] for name in ("start", "best")}
-        away.append(100 * (L["best"] / L["start"] - 1))
-    text = "{:.0f}, {:.0f} and {:.0f} % on straight, c and s, {:.0f} and {:.0f} % on sideways"
-    yield DOCS / "howto" / "own.md", text.format(*changes, *away)
+    cells = []
+    for of in report("own_controller.json")["trajectories"].values():
+        cells += [100 * np.hypot(*of[name]["rms"]["position"][:2]) for name in ("expert", "best")]
+    text = "from {:.1f} to {:.1f} cm on straight, {:.1f} to {:.1f} on s, {:.1f} to {:.1f} on "
+    text += "sideways and {:.1f} to {:.1f} on turn"
+    yield DOCS / "howto" / "own.md", text.format(*cells)
     notes, walks = ROOT / "experiments" / "notes.md", report("many-plants/walks.json")["L"]
     best_of_then, searched = (np.array([*walks[name].values()]) for name in ("best", "search"))
     lower = -100 * np.expm1(np.log(searched / best_of_then).mean(axis=1))

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from itertools import product
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +14,9 @@ from hector_jax.control.controller import contacts_needed, plan
 from hector_jax.control.parameters import gradient_by_steps, step_names
 from hector_jax.control.reference import anchor_at, named_command
 from hector_jax.control.weights import nominal
+from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.inputs import InputError
-from hector_jax.own.planner import call_planner, plan_inputs
+from hector_jax.own.planner import _closest, call_planner, compare_calls, plan_inputs
 from hector_jax.own.program import program_of
 from hector_jax.own.walk_log import at_ticks, log_of, trajectory_of
 from hector_jax.sim.loop import Job
@@ -122,7 +124,10 @@ plans["force"] = asked["weights.R.force"]
             "del plans['moment']",
             r"its plans: moment must hold finite numbers of shape \(24, 2, 3\)",
         ),
-        ("plans['force'] = np.full((*rows, 3), np.nan)", "its plans: force must hold finite numbers"),
+        (
+            "plans['force'] = np.full((*rows, 3), np.nan)",
+            "its plans: force must hold finite numbers",
+        ),
         ("plans['force'] = plans['force'][:4]", r"its plans: force must .* got shape \(4, 2, 3\)"),
         ("sys.exit(3)", "ended with code 3"),
         ("sys.exit(0)", r"ended with code 0, but wrote no plans\.npz"),
@@ -140,3 +145,65 @@ def test_a_program_plans_or_is_told_what_is_wrong(walked, tmp_path, change, told
             call()
     else:
         np.testing.assert_array_equal(call().force, weights.R.force)
+
+
+def answers(walked, change=lambda x: x):
+    """Answer with the wrenches of a walk, changed, which no weight and no state moves."""
+
+    def call(asked):
+        at = np.round(asked.time / CONFIG.gait.tick).astype(int)
+        wrench = np.concatenate(walked.command, axis=-1)[at]
+        force, moment = np.split(change(wrench), 2, axis=-1)
+        step = asked.state.velocity[:, None] * np.ones((1, 2, 1))
+        return Planned(force, moment, step)
+
+    return call
+
+
+@pytest.mark.parametrize(
+    ("change", "fit"),
+    [
+        (lambda x: x, ()),
+        (lambda x: -x, ("reversed",)),
+        (lambda x: x[:, ::-1], ("left and right exchanged",)),
+        (lambda x: -x[:, ::-1], ("left and right exchanged", "reversed")),
+        (lambda x: 1.2 * x, ()),
+    ],
+)
+def test_another_convention_of_the_plans_is_found(walked, change, fit):
+    inputs = plan_inputs(CONFIG, ROBOT, WEIGHTS, COMMAND, walked)
+    calls = compare_calls(answers(walked, change), CONFIG, ROBOT, inputs, walked)
+    assert calls.fit == fit
+    assert calls.parity.plans == len(inputs.time)
+    assert calls.idle == step_names(WEIGHTS)
+    assert (calls.again, calls.jumps, calls.steps) == (0.0, 0.0, True)
+
+
+@pytest.mark.parametrize(("axes", "into"), product(("heading", "trunk"), (True, False)))
+def test_axes_of_the_wrenches_are_found(axes, into):
+    """Of a robot that turns and leans, with forces that no other convention explains."""
+    rng = np.random.default_rng(0)
+    euler = np.stack([*rng.normal(size=(2, 30)) * 0.2, np.linspace(0.5, 2.5, 30)], axis=1)
+    logged = rng.normal(size=(30, 2, 6))
+    angles = euler * [0.0, 0.0, 1.0] if axes == "heading" else euler
+    R = np.asarray(jax.vmap(rotation_from_euler)(angles))
+    R = R if into else np.swapaxes(R, 1, 2)
+    turned = np.einsum("nij,nfpj->nfpi", R, logged.reshape(30, 2, 2, 3)).reshape(30, 2, 6)
+    text = f"turned {'into' if into else 'out of'} the {axes}'s axes"
+    found, distance = _closest(logged, turned, euler)
+    assert found == (text,)
+    assert distance < 1e-12
+
+
+def test_a_memory_and_jumps_of_a_planner_are_told(walked):
+    inputs, calls = plan_inputs(CONFIG, ROBOT, WEIGHTS, COMMAND, walked), []
+
+    def warm(asked):
+        calls.append(asked)
+        plans = answers(walked)(asked)
+        jump = 30.0 * (asked.state.velocity[:, :1, None] % 1e-3 > 5e-4)
+        return plans._replace(force=plans.force + len(calls) + jump)
+
+    found = compare_calls(warm, CONFIG, ROBOT, inputs, walked)
+    assert found.again == pytest.approx(1.0)
+    assert found.jumps > 0.1

@@ -277,9 +277,9 @@ def _campaign(run: _Run) -> tuple[Campaign, int]:
     """Return the tuning of `best` on walks, from the start of that on the model, and its budget."""
     robot, args, (config, start) = run.setup.robot, run.args, run.settings_of_best
     plants, budget = best_set.walk_plants(robot, args.walk_plants, args.walks, len(run.commands))
-    settings = best_set.on_walks(config)
-    inputs = run.folder / "walks", settings, robot, start, run.commands, plants
-    return Campaign(*inputs, arguments.engine_of(args)), budget
+    settings, engine = best_set.on_walks(config), arguments.engine_of(args)
+    folder, commands = run.folder / "walks", run.commands
+    return Campaign(folder, settings, robot, start, commands, plants, engine), budget
 
 
 def _walk_sets(run: _Run, sets: Mapping[str, Weights]) -> tuple[Judged, Judged]:

@@ -1,6 +1,7 @@
 """A controller of the user: what the logs of its walks show, its twin, a tuning on its walks."""
 
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -19,7 +20,7 @@ from hector_jax.core.runtime import workers
 from hector_jax.core.trajectory import FEET
 from hector_jax.own.log_check import check_log, read_check
 from hector_jax.own.parity import COMPONENTS, Parity, compare_plans
-from hector_jax.own.planner import Calls, compare_calls, plan_inputs
+from hector_jax.own.planner import Calls, call_planner, compare_calls, plan_inputs
 from hector_jax.own.program import program_of
 from hector_jax.own.walk_file import read_walk
 from hector_jax.own.walk_log import at_ticks, log_of, trajectory_of
@@ -59,7 +60,7 @@ def run_twin(args: Twin) -> None:
     if planner := arguments.planner_of(args):
         ticks = trajectory_of(at_ticks(log_of(walk), config.gait.tick))
         inputs = plan_inputs(config, robot, weights, trajectory.command, ticks)
-        calls = compare_calls(planner, config, robot, inputs, ticks)
+        calls = compare_calls(partial(call_planner, planner), config, robot, inputs, ticks)
         parity = calls.parity
     else:
         parity = compare_plans(config, robot, weights, trajectory.command, walk)
@@ -76,6 +77,8 @@ def _call_lines(calls: Calls) -> Iterator[str]:
     if calls.again > 1e-6:
         text = "a second call at the same inputs differs by"
         yield f"{text} {calls.again:.2g}: the plan has a memory, such as a warm start or a filter"
+    if calls.fit:
+        yield f"to {calls.fitted:.2g} they are those of the log if they are {', '.join(calls.fit)}"
     if calls.jumps:
         yield f"{100 * calls.jumps:.0f} % of the plans jump when a state is moved by 0.1 mm"
     if calls.idle:
@@ -155,15 +158,19 @@ def tune_walker(folder: Path, args: Tune) -> None:
             raise InputError(f"--start {args.start}: {tuned.reason}; tune from another")
         compared = {"start": campaign.start, "best": tuned.sets[tuned.best].weights}
         setup = Setup(pool, config, robot)
-        options = {"seconds": seconds, "folder": folder / "scores", "engine": campaign.engine}
+        options: dict[str, Any] = {
+            "seconds": seconds,
+            "folder": folder / "scores",
+            "engine": campaign.engine,
+        }
         for name, weights in compared.items():
             save_weights(folder / "weights" / f"{name}.json", weights)
         seeds = range(args.seeds)
         drawn = arguments.plants("standin", seeds, robot.description)
-        title, inputs = f"evaluating on {plural(len(seeds), 'plant')}", (drawn, seeds)
-        judged = judging.judge(setup, compared, commands, *inputs, title=title, **options)
+        options["title"] = f"evaluating on {plural(len(seeds), 'plant')}"
+        judged = judging.judge(setup, compared, commands, drawn, seeds, **options)
     first = tuned.sets[0].losses.reshape(len(campaign.plants), -1)
-    if len(first) > 1 and np.ptp(first, axis=0).max() == 0.0:
+    if len(first) > 1 and (first == first[0]).all():
         say(f"the walks of {args.walker} do not depend on `plant`: --walk-plants 1 tells as much")
     verdict = judged.verdict
     result = {**metrics.verdict_result({"standin": verdict}), "walks": tuned.rows}

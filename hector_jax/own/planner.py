@@ -8,18 +8,20 @@ The inputs are those of `PlanInputs`, by entries named like its leaves, such as 
 and `weights.Q.position` (N, 3); its plans are `force`, `moment` and `touchdown` (N, feet, 3).
 """
 
-from functools import partial
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.parameters import step_names
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights
+from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree_file import named_leaves
@@ -27,10 +29,18 @@ from hector_jax.own.parity import Parity
 from hector_jax.own.program import Program, call_program
 from hector_jax.own.walk_file import read_entries
 from hector_jax.robot.model import Robot
-from hector_jax.tuning.called import CalledPlans, PlanInputs, Planned, call_along, move_sizes
+from hector_jax.tuning.called import (
+    CalledPlans,
+    CallPlans,
+    PlanInputs,
+    Planned,
+    call_along,
+    move_sizes,
+)
 from hector_jax.tuning.grounded import begins_of_ticks
 
 _JUMP = 0.02  # share of the weight by which a plan may change with the smallest moves
+_CLOSER = 0.3  # share of the distance to a log that is left if another convention explains it
 
 
 def call_planner(planner: Program, asked: PlanInputs) -> Planned:
@@ -85,11 +95,11 @@ def plan_inputs(
     )
 
 
-def called_plans(planner: Program, config: WalkConfig, inputs: PlanInputs) -> CalledPlans:
-    """Call a program along a walk, for `grounded.fit_grounding`.
+def called_plans(call: CallPlans, config: WalkConfig, inputs: PlanInputs) -> CalledPlans:
+    """Call a controller along a walk, for `grounded.fit_grounding`.
 
     Args:
-        planner: the program.
+        call: the controller, such as `call_planner` of a program.
         config: ticks between plans.
         inputs: from `plan_inputs`; all numbers beside Q and R are tuned.
 
@@ -97,7 +107,7 @@ def called_plans(planner: Program, config: WalkConfig, inputs: PlanInputs) -> Ca
         InputError: see `call_planner`.
     """
     made = np.arange(1, 1 + len(inputs.time)) % config.twin.plan_ticks == 0
-    return call_along(partial(call_planner, planner), inputs, made, tuple(inputs.weights.others))
+    return call_along(call, inputs, made, tuple(inputs.weights.others))
 
 
 class Calls(NamedTuple):
@@ -108,15 +118,50 @@ class Calls(NamedTuple):
     jumps: float  # share of the plans that jump when a state or a foot is moved a little
     idle: tuple[str, ...]  # names of the weights that change no plan
     steps: bool  # whether the touchdowns follow the velocity
+    fit: tuple[str, ...]  # what makes the plans those of the log, if they are not; see `_closest`
+    fitted: float  # [N, N m] largest difference then
+
+
+def _closest(
+    logged: Float[np.ndarray, "N feet 6"],
+    called: Float[np.ndarray, "N feet 6"],
+    euler: Float[np.ndarray, "N 3"],
+) -> tuple[tuple[str, ...], float]:
+    """Return under which other conventions plans are closest to a log, and their distance then.
+
+    Tried are the order of the legs, the sign of the wrenches and the axes that they are in.
+    """
+    heading, trunk = (
+        np.asarray(jax.vmap(rotation_from_euler)(angles))
+        for angles in (euler * np.array([0.0, 0.0, 1.0]), euler)
+    )
+    world = np.broadcast_to(np.eye(3), trunk.shape)
+    axes = {
+        "": world,
+        "turned out of the heading's axes": heading,
+        "turned out of the trunk's axes": trunk,
+        "turned into the heading's axes": np.swapaxes(heading, 1, 2),
+        "turned into the trunk's axes": np.swapaxes(trunk, 1, 2),
+    }
+    left_right = np.arange(called.shape[1]).reshape(-1, 2)[:, ::-1].ravel()
+    found = {}
+    for (turned, R), feet, sign in product(axes.items(), ("", "left and right exchanged"), (1, -1)):
+        ordered = called[:, left_right] if feet else called
+        parts = sign * ordered.reshape(*ordered.shape[:2], 2, 3)
+        there = np.einsum("nij,nfpj->nfpi", R, parts).reshape(called.shape)
+        words = turned, feet, "reversed" if sign < 0 else ""
+        found[tuple(filter(None, words))] = float(np.abs(there - logged).max())
+    closest = min(found, key=lambda words: found[words])
+    return (closest if found[closest] < _CLOSER * found[()] else ()), found[closest]
 
 
 def compare_calls(
-    planner: Program, config: WalkConfig, robot: Robot, inputs: PlanInputs, walk: Trajectory
+    call: CallPlans, config: WalkConfig, robot: Robot, inputs: PlanInputs, walk: Trajectory
 ) -> Calls:
-    """Call a planner along a log, and compare its plans with the commands of the log.
+    """Call a controller along a log, and compare its plans with the commands of the log.
 
     Args:
-        planner: the program.
+        call: the controller, such as `call_planner` of a program.
         config, robot: of `plan_inputs`.
         inputs: of the walk.
         walk: the log.
@@ -124,7 +169,7 @@ def compare_calls(
     Raises:
         InputError: see `call_planner`.
     """
-    first, second = (called_plans(planner, config, inputs) for _ in range(2))
+    first, second = (called_plans(call, config, inputs) for _ in range(2))
     row, foot = np.nonzero(first.made[:, None] & first.contact)
     logged = np.concatenate(walk.command, axis=-1)[1:]
     called = np.asarray(first.values)[..., :6]
@@ -143,6 +188,8 @@ def compare_calls(
     changes = np.abs(by_body[..., :6, :]).max(axis=(1, 2)) * move_sizes(body)
     weight = float(robot.mass * np.linalg.norm(robot.gravity))
     names = step_names(inputs.weights, tuple(inputs.weights.others))
+    rows = np.asarray(first.made)
+    fit, fitted = _closest(logged[: len(rows)][rows], called[rows], inputs.state.euler[rows])
     idle = np.abs(by_weights).max(axis=(0, 1, 2)) == 0.0
     return Calls(
         parity,
@@ -150,4 +197,6 @@ def compare_calls(
         jumps=float(np.mean(changes.max(axis=1) > _JUMP * weight)),
         idle=tuple(name for name, none in zip(names, idle, strict=True) if none),
         steps=bool(np.any(by_body[..., 6:8, 9:11])),
+        fit=fit,
+        fitted=fitted,
     )

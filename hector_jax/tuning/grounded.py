@@ -73,10 +73,13 @@ def begins_of_ticks(robot: Robot, walk: Trajectory) -> tuple[MeasuredState, Meas
         walk: see `fit_grounding`.
     """
     assert walk.belief is not None  # zero in a log without it
-    begins = jax.tree.map(lambda x: x[:-1], (walk.state, walk.joints))
-    errors = jax.tree.map(lambda x: x[1:], walk.belief[:2])
-    estimated = jax.tree.map(jnp.add, begins, errors)
-    return measured_states(robot, *begins), measured_states(robot, *estimated)
+    state, joints = jax.tree.map(lambda x: x[:-1], (walk.state, walk.joints))
+    errors = jax.tree.map(lambda x: x[1:], walk.belief)
+    true, estimate = (
+        measured_states(robot, state, joints),
+        jax.tree.map(jnp.add, state, errors.state),
+    )
+    return true, measured_states(robot, estimate, joints + errors.joints)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -39,7 +39,7 @@ from hector_jax.core.journal import continue_journal, write_rows
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
 from hector_jax.grfm import network
-from hector_jax.own.planner import called_plans, plan_inputs
+from hector_jax.own.planner import call_planner, called_plans, plan_inputs
 from hector_jax.own.walk_log import Log, ScoredLog, evaluate_log, log_of, trajectory_of, walker_hash
 from hector_jax.sim.loop import Job
 from hector_jax.store.cache import content_key, robot_hash
@@ -132,11 +132,11 @@ def _slope(
     if campaign.planner is not None:
         controller = config.rollout.walk
         inputs = plan_inputs(controller, robot, weights, scenario.command, walk)
-        called = called_plans(campaign.planner, controller, inputs)
+        called = called_plans(partial(call_planner, campaign.planner), controller, inputs)
     grounding = fit_grounding(config.rollout, scenario, weights, walk, called=called)
-    inputs = config.rollout, grounding, weights, config.loss
     options = {"walk": grounded_rollout, "others": config.others}
-    return jax.device_get(least_squares_jit(*inputs, **options))
+    found = least_squares_jit(config.rollout, grounding, weights, config.loss, **options)
+    return jax.device_get(found)
 
 
 def first_slope(campaign: Campaign) -> None:
@@ -233,12 +233,11 @@ class _Walks:
 
         numbers = len(parameters.step_names(weights, campaign.config.others))
         gradient, matrix = jax.tree.map(np.zeros_like, weights), np.zeros((numbers, numbers))
-        residual, fallen = 0.0, float(not usable)
+        residual, fallen = np.zeros(()), np.asarray(float(not usable))
         if usable:
             gradient, matrix = mean([(found.gradient, curved) for found, curved in usable])
             residual = np.max([found.residual for found, _ in usable])
-        checks = np.asarray(fallen), np.asarray(residual)
-        return Evaluation(np.asarray(value), {}, gradient, *checks), matrix
+        return Evaluation(np.asarray(value), {}, gradient, fallen, np.asarray(residual)), matrix
 
 
 def tune_on_walks(
