@@ -23,6 +23,7 @@ def plans(asked: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         robot.Q[:12] = np.concatenate([x[row] for x in Q.values()])
         robot.R = np.concatenate([x[row].ravel() for x in R.values()])
         x = np.append(states[row], 1.0)
+        robot.wrench[:] = np.nan  # what it would keep if it did not solve the plan
         wrenches[row] = robot.plan(time, x, feet[row], yaws[row])
         footholds[row] = [[*robot.foothold(time, x, foot)[0][:2], 0.0] for foot in range(2)]
     force, moment = np.split(wrenches, 2, axis=2)

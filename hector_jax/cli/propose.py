@@ -36,8 +36,7 @@ def run_propose(args: Propose) -> None:
     make_folder(args.folder)
     with locked(args.folder), workers(PROCESSES) as pool:
         found = added_logs.read_campaign(pool, campaign)
-        if not path.exists():  # last, so that rejected flags can be corrected
-            write_json(path, {"flags": as_table(args)})
+        write_json(path, {"flags": as_table(args)})  # last, so that rejected flags can be corrected
     number, ended = found.number, found.tuning.reason
     weights = walks.weights_path(args.folder, number)
     result = {"walk": number, "weights": str(weights), "ended": ended}
@@ -176,4 +175,7 @@ def _campaign(args: Propose) -> Campaign:
     start = arguments.weights_by_name(start, robot)
     commands = {trajectory.name: trajectory.command for trajectory in trajectories}
     planner = arguments.planner_of(args)
+    if planner and config.others:
+        text = "--tune must be weights beside --planner, which plans by Q and R"
+        raise InputError(f"{text}, got {' '.join(args.tune)}")
     return Campaign(args.folder, config, robot, start, commands, planner=planner)

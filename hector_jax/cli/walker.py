@@ -20,7 +20,14 @@ from hector_jax.core.runtime import workers
 from hector_jax.core.trajectory import FEET
 from hector_jax.own.log_check import check_log, read_check
 from hector_jax.own.parity import COMPONENTS, Parity, compare_plans
-from hector_jax.own.planner import Calls, call_planner, compare_calls, plan_inputs
+from hector_jax.own.planner import (
+    JUMP,
+    Calls,
+    call_planner,
+    compare_calls,
+    distance_to_log,
+    plan_inputs,
+)
 from hector_jax.own.program import program_of
 from hector_jax.own.walk_file import read_walk
 from hector_jax.own.walk_log import at_ticks, log_of, trajectory_of
@@ -198,7 +205,16 @@ def _check_first(args: Tune, campaign: Campaign, seconds: float) -> None:
         write_log(program_of(args.walker, args.walker_limit), job, path)
         try:
             log, end = read_check(path, campaign.robot, command, seconds, walk.gait.tick)
+            walked, _ = read_walk(path, campaign.robot, seconds, walk.gait.tick)
         except InputError as error:
             raise InputError(str(error).replace(str(path), f"{args.walker}: its log")) from None
-    for line in [*([end] if end else []), *check_log(log, walk.plan_interval)]:
+    lines = [*([end] if end else []), *check_log(log, walk.plan_interval)]
+    if campaign.planner and not end:
+        ticks = trajectory_of(at_ticks(log_of(walked), walk.gait.tick))
+        inputs = plan_inputs(walk, campaign.robot, campaign.start, command, ticks)
+        away = distance_to_log(partial(call_planner, campaign.planner), walk, inputs, ticks)
+        if away > JUMP * float(campaign.robot.mass * np.linalg.norm(campaign.robot.gravity)):
+            text = f"the plans of {args.planner} differ from its commands by up to {away:.0f} N"
+            lines.append(f"{text}: hector log twin --planner tells where")
+    for line in lines:
         say(f"before any tuning, {name}: {line}")

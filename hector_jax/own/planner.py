@@ -15,12 +15,11 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from hector_jax.control.controller import WalkConfig
-from hector_jax.control.parameters import step_names
 from hector_jax.control.reference import Command
-from hector_jax.control.weights import Weights
+from hector_jax.control.weights import Weights, direction_names
 from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory
@@ -35,11 +34,12 @@ from hector_jax.tuning.called import (
     PlanInputs,
     Planned,
     call_along,
+    call_rows,
     move_sizes,
 )
 from hector_jax.tuning.grounded import begins_of_ticks
 
-_JUMP = 0.02  # share of the weight by which a plan may change with the smallest moves
+JUMP = 0.02  # share of the weight by which a plan may change with the smallest moves
 _CLOSER = 0.3  # share of the distance to a log that is left if another convention explains it
 
 
@@ -54,12 +54,17 @@ def call_planner(planner: Program, asked: PlanInputs) -> Planned:
         inputs, plans = Path(folder) / "inputs.npz", Path(folder) / "plans.npz"
         np.savez(inputs, **named_leaves(asked))
         call_program(planner, inputs, plans)
-        found = read_entries(plans, Planned._fields)
+        try:
+            found = read_entries(plans, Planned._fields)
+        except InputError as error:
+            raise InputError(str(error).replace(str(plans), f"{planner.path}: its plans")) from None
     for name in Planned._fields:
-        got = np.shape(found.get(name, "none"))
-        if got != (rows, feet, 3) or not np.isfinite(found[name]).all():
-            text = f"{name} must hold finite numbers of shape {(rows, feet, 3)}"
-            raise InputError(f"{planner.path}: its plans: {text}, got shape {got}")
+        if name not in found:
+            raise InputError(f"{planner.path}: its plans: {name} is missing")
+        x, shape = found[name], (rows, feet, 3)
+        if x.shape != shape or x.dtype.kind not in "iuf" or np.isinf(x).any():
+            text = f"{name} must hold numbers of shape {shape}, NaN where a plan is not solved"
+            raise InputError(f"{planner.path}: its plans: {text}; got {x.dtype} of {x.shape}")
     return Planned(**found)
 
 
@@ -76,7 +81,7 @@ def plan_inputs(
     Raises:
         InputError: the walk is shorter than two plans.
     """
-    if (stood := int(np.sum(~walk.fallen))) < 3:
+    if (stood := int(np.sum(~walk.fallen))) <= 2 * config.twin.plan_ticks:
         raise InputError(f"a walk of at least two plans of {config.plan_interval:g} s is needed")
     samples = walk._replace(period=None, initial=None)
     walk = jax.tree.map(lambda x: x[:stood], samples)._replace(
@@ -101,20 +106,37 @@ def called_plans(call: CallPlans, config: WalkConfig, inputs: PlanInputs) -> Cal
     Args:
         call: the controller, such as `call_planner` of a program.
         config: ticks between plans.
-        inputs: from `plan_inputs`; all numbers beside Q and R are tuned.
+        inputs: from `plan_inputs`.
 
     Raises:
         InputError: see `call_planner`.
     """
-    made = np.arange(1, 1 + len(inputs.time)) % config.twin.plan_ticks == 0
-    return call_along(call, inputs, made, tuple(inputs.weights.others))
+    return call_along(call, inputs, plans_at(config, inputs))
+
+
+def plans_at(config: WalkConfig, inputs: PlanInputs) -> Bool[np.ndarray, " T"]:
+    """Return at which ticks of a walk the controller plans."""
+    return np.arange(1, 1 + len(inputs.time)) % config.twin.plan_ticks == 0
+
+
+def distance_to_log(
+    call: CallPlans, config: WalkConfig, inputs: PlanInputs, walk: Trajectory
+) -> float:
+    """Return the largest difference of plans by call from the commands of a walk [N, N m].
+
+    Args, Raises: see `compare_calls`.
+    """
+    rows = np.flatnonzero(plans_at(config, inputs))
+    logged = np.concatenate(walk.command, axis=-1)[1:][rows]
+    away = np.abs(call_rows(call, inputs, rows)[..., :6] - logged)[inputs.contact[rows]]
+    return float(np.nanmax(away, initial=0.0))
 
 
 class Calls(NamedTuple):
     """What calling a planner along a log shows."""
 
     parity: Parity  # of the plans by call, in place of those of a twin
-    again: float  # [N, N m] largest difference between two calls at the same inputs
+    again: float  # [N, N m] largest difference between two calls, the other one in reverse order
     jumps: float  # share of the plans that jump when a state or a foot is moved a little
     idle: tuple[str, ...]  # names of the weights that change no plan
     steps: bool  # whether the touchdowns follow the velocity
@@ -126,10 +148,11 @@ def _closest(
     logged: Float[np.ndarray, "N feet 6"],
     called: Float[np.ndarray, "N feet 6"],
     euler: Float[np.ndarray, "N 3"],
+    contact: Bool[np.ndarray, "N feet"],
 ) -> tuple[tuple[str, ...], float]:
     """Return under which other conventions plans are closest to a log, and their distance then.
 
-    Tried are the order of the legs, the sign of the wrenches and the axes that they are in.
+    Tried are left and right exchanged, the sign of the wrenches and the axes that they are in.
     """
     heading, trunk = (
         np.asarray(jax.vmap(rotation_from_euler)(angles))
@@ -150,7 +173,7 @@ def _closest(
         parts = sign * ordered.reshape(*ordered.shape[:2], 2, 3)
         there = np.einsum("nij,nfpj->nfpi", R, parts).reshape(called.shape)
         words = turned, feet, "reversed" if sign < 0 else ""
-        found[tuple(filter(None, words))] = float(np.abs(there - logged).max())
+        found[tuple(filter(None, words))] = float(np.abs(there - logged)[contact].max())
     closest = min(found, key=lambda words: found[words])
     return (closest if found[closest] < _CLOSER * found[()] else ()), found[closest]
 
@@ -169,7 +192,10 @@ def compare_calls(
     Raises:
         InputError: see `call_planner`.
     """
-    first, second = (called_plans(call, config, inputs) for _ in range(2))
+    first = called_plans(call, config, inputs)
+    # another order, in which a plan that rests on the one before it is another
+    rows = np.flatnonzero(first.made)
+    again = call_rows(call, inputs, rows[::-1])[::-1] - first.values[rows]
     row, foot = np.nonzero(first.made[:, None] & first.contact)
     logged = np.concatenate(walk.command, axis=-1)[1:]
     called = np.asarray(first.values)[..., :6]
@@ -187,14 +213,14 @@ def compare_calls(
     by_body, by_weights = np.split(first.slopes[first.made], [body], axis=-1)
     changes = np.abs(by_body[..., :6, :]).max(axis=(1, 2)) * move_sizes(body)
     weight = float(robot.mass * np.linalg.norm(robot.gravity))
-    names = step_names(inputs.weights, tuple(inputs.weights.others))
-    rows = np.asarray(first.made)
-    fit, fitted = _closest(logged[: len(rows)][rows], called[rows], inputs.state.euler[rows])
+    names = direction_names(inputs.weights)
+    stands = np.asarray(inputs.contact)[rows]
+    fit, fitted = _closest(logged[rows], called[rows], inputs.state.euler[rows], stands)
     idle = np.abs(by_weights).max(axis=(0, 1, 2)) == 0.0
     return Calls(
         parity,
-        again=float(np.abs(second.values - first.values).max()),
-        jumps=float(np.mean(changes.max(axis=1) > _JUMP * weight)),
+        again=float(np.nanmax(np.abs(again))),
+        jumps=float(np.mean(changes.max(axis=1) > JUMP * weight)),
         idle=tuple(name for name, none in zip(names, idle, strict=True) if none),
         steps=bool(np.any(by_body[..., 6:8, 9:11])),
         fit=fit,

@@ -6,7 +6,7 @@ that a rollout near the walk asks of it, so a controller in any language has a g
 
 It must plan without memory: a call at the same inputs gives the same plan. The touchdowns are
 part of the plan, since stepping is what keeps a robot upright: without them the derivatives of a
-walk grow without bound.
+walk grow without bound. The yaws of feet are not moved; a foot in the air moves with its touchdown.
 """
 
 from collections.abc import Callable
@@ -16,14 +16,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from hector_jax import qp
 from hector_jax.control.controller import Plan
 from hector_jax.control.footstep import Feet
-from hector_jax.control.parameters import step_names, stepped
+from hector_jax.control.parameters import stepped
 from hector_jax.control.reference import Command
-from hector_jax.control.weights import Weights
+from hector_jax.control.weights import Weights, direction_names
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import Disturbance, State, Wrench
 
@@ -49,7 +49,7 @@ class PlanInputs(NamedTuple):
 
 
 class Planned(NamedTuple):
-    """What it answers."""
+    """What it answers; NaN in a row whose plan was not solved."""
 
     force: Float[np.ndarray, "N feet 3"]  # of the ground on each foot [N], world frame
     moment: Float[np.ndarray, "N feet 3"]  # about the foot points [N m]
@@ -106,22 +106,31 @@ class CalledPlans(NamedTuple):
         )
 
 
-def call_along(
-    call: CallPlans, inputs: PlanInputs, made: Bool[np.ndarray, " T"], others: tuple[str, ...] = ()
-) -> CalledPlans:
+def call_rows(
+    call: CallPlans, inputs: PlanInputs, rows: Int[np.ndarray, " N"]
+) -> Float[np.ndarray, "N feet 9"]:
+    """Return the plans at some ticks of a walk, in this order; see `call_along`."""
+    time, state, feet, contact = jax.tree.map(lambda x: np.asarray(x)[rows], inputs[:4])
+    weights = jax.tree.map(lambda x: np.stack([x] * len(rows)), inputs.weights)
+    asked = PlanInputs(time, state, feet, contact, weights, inputs.command, inputs.initial)
+    return np.concatenate(call(asked), axis=-1)
+
+
+def call_along(call: CallPlans, inputs: PlanInputs, made: Bool[np.ndarray, " T"]) -> CalledPlans:
     """Call a controller along a walk, at each plan once and once more for each number moved.
+
+    Where it does not solve a plan the last one is kept, and a moved one counts as no change.
 
     Args:
         call: the controller.
         inputs: at the T ticks of the walk; its weights have no leading axis.
         made: ticks at which the controller plans.
-        others: names of numbers that are tuned beside Q and R.
 
     Raises:
         InputError: from `call`.
     """
     body, rows = np.asarray(_body(inputs.state, inputs.feet)), np.flatnonzero(made)
-    feet, numbers = inputs.contact.shape[1], len(step_names(inputs.weights, others))
+    feet, numbers = inputs.contact.shape[1], len(direction_names(inputs.weights))
     sizes = np.append(move_sizes(body.shape[1]), np.full(numbers, LOG_STEP))
     moves = np.concatenate([np.zeros((1, len(sizes))), np.diag(sizes)])
     of_body, of_weights = np.split(moves, [body.shape[1]], axis=1)
@@ -130,7 +139,7 @@ def call_along(
         return np.tile(np.asarray(x)[rows], (len(moves), *[1] * (np.ndim(x) - 1)))
 
     parts = np.split(repeated(body) + np.repeat(of_body, len(rows), axis=0), [3, 6, 9, 12], axis=1)
-    sets = [stepped(inputs.weights, steps, others) for steps in of_weights]
+    sets = [stepped(inputs.weights, steps) for steps in of_weights]
     asked = inputs._replace(
         time=repeated(inputs.time),
         state=State(*parts[:4]),
@@ -139,6 +148,9 @@ def call_along(
         weights=jax.tree.map(lambda *x: np.repeat(np.stack(x), len(rows), axis=0), *sets),
     )
     answers = np.concatenate(call(asked), axis=-1).reshape(len(moves), len(rows), feet, 9)
-    slopes = (answers[1:] - answers[0]) / np.reshape(sizes, (-1, 1, 1, 1))
+    slopes = np.nan_to_num(answers[1:] - answers[0]) / np.reshape(sizes, (-1, 1, 1, 1))
+    solved = np.isfinite(answers[0]).all(axis=(1, 2))
     at = np.maximum(np.cumsum(made) - 1, 0)  # of the last plan; between plans none is used
-    return CalledPlans(body, inputs.contact, made, answers[0][at], np.moveaxis(slopes, 0, -1)[at])
+    made = made & solved[at]
+    values, slopes = np.nan_to_num(answers[0])[at], np.moveaxis(slopes, 0, -1)[at]
+    return CalledPlans(body, inputs.contact, made, values, slopes)

@@ -32,7 +32,7 @@ class MeasuredState(NamedTuple):
     """Measurements at the start of a tick; also differences of such, the residual of the model."""
 
     state: State  # of the base
-    feet: Feet  # positions of the feet; those in the air are not used
+    feet: Feet  # positions of the feet; of those in the air only a frozen twin or a planner knows
 
 
 def measured_states(robot: Robot, state: State, joints: Array) -> MeasuredState:
@@ -139,7 +139,7 @@ def _planner(
     """Return what plans in a tick: another controller, called with `start`; None: this one."""
     if called is None:
         return None
-    steps = parameters.steps_between(start, weights, tuple(start.others))
+    steps = parameters.steps_between(start, weights)
     last = jax.tree.map(lambda x: x[0], carry.commands)
     return partial(called.plan, steps=steps, last=last, disturbance=carry.disturbance)
 

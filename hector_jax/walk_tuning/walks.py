@@ -123,8 +123,11 @@ def walk_case(campaign: Campaign, weights: Weights, case: int) -> ScoredLog:
 
 def _slope(
     campaign: Campaign, weights: Weights, case: int, log: Log
-) -> tuple[Evaluation, Float[np.ndarray, "n n"]]:
-    """Return loss, gradient and matrix of the plain rigid body grounded on a walk."""
+) -> tuple[Evaluation, Float[np.ndarray, "n n"]] | InputError:
+    """Return loss, gradient and matrix of the plain rigid body grounded on a walk.
+
+    If the planner of the user gives no plans of it this returns its error: others may go on.
+    """
     config, robot = campaign.config, campaign.robot
     effect = network.effect_of(None, config.rollout.walk)
     scenario = Scenario(robot, campaign.cases[case][1], standing_anchor(robot), effect)
@@ -132,7 +135,10 @@ def _slope(
     if campaign.planner is not None:
         controller = config.rollout.walk
         inputs = plan_inputs(controller, robot, weights, scenario.command, walk)
-        called = called_plans(partial(call_planner, campaign.planner), controller, inputs)
+        try:
+            called = called_plans(partial(call_planner, campaign.planner), controller, inputs)
+        except InputError as error:
+            return error
     grounding = fit_grounding(config.rollout, scenario, weights, walk, called=called)
     options = {"walk": grounded_rollout, "others": config.others}
     found = least_squares_jit(config.rollout, grounding, weights, config.loss, **options)
@@ -224,7 +230,13 @@ class _Walks:
         refused = stood.sum() < np.isfinite(self.losses[0]).sum()
         on = [] if refused else np.flatnonzero(stood).tolist()  # a slope takes as long as a walk
         some = [logs[case].log for case in on]
-        slopes = self.pool.map(_slope, repeat(campaign), repeat(weights), on, some)
+        found = list(self.pool.map(_slope, repeat(campaign), repeat(weights), on, some))
+        errors = [x for x in found if isinstance(x, InputError)]
+        for error in errors:
+            if len(errors) == len(found) and not number:
+                raise error
+            say(f"a walk without its slope: {error}")
+        slopes = [x for x in found if not isinstance(x, InputError)]
         usable = [x for x in slopes if step_status(campaign.config, x[0]) == StepStatus.ACCEPTED]
         shares = [value / len(losses) / float(found.loss) for found, _ in usable]
 
@@ -316,7 +328,6 @@ def _head(campaign: Campaign) -> dict[str, Any]:
         "robot": robot_hash(campaign.robot),
         "settings": content_key(settings, campaign.start, code=()),
         "engine": campaign.engine.key,
-        "planner": campaign.planner and campaign.planner.content,
         "code": code_hash("walk_tuning.walks", *campaign.engine.modules),
     }
 
