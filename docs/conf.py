@@ -54,6 +54,7 @@ PACKAGES = {  # in this order: title and purpose of each page of the reference
     "store": ("Store", "What is computed once and kept: walks, nets, tunings, runs."),
     "verdict": ("Verdict", "Walks of weight sets, scores and their statistics."),
     "importing": ("Importing", "The settings of robots that others publish, by rules."),
+    "own": ("Your own controller", "Logs, programs and plans that are not of this project."),
     "walk_tuning": ("Tuning on walks", "The tuning whose value is walks; their logs and record."),
     "export": ("Export", "Weights and controller as files for a robot's computer."),
     "report": ("Report", "Tables, pictures, films and pages of a run."),
@@ -61,14 +62,14 @@ PACKAGES = {  # in this order: title and purpose of each page of the reference
 PUBLIC = {  # of packages without `__all__`, in whichever of their modules they are defined
     "core": "State Wrench Load Trajectory InputError setup_jax",
     "robot": "Robot load_robot Description foot_poses foot_jacobians inverse_legs linearise",
-    "sim": """Imperfections ideal hfs hfs_varied standin Job walk Engine choose_engine walker_of
-        walker_engine compare_plans""",
+    "sim": "Imperfections ideal hfs hfs_varied standin Job walk Engine choose_engine",
     "grfm": "Window Effect Phi as_effect load_net save_net TrainConfig train",
     "tuning": """RolloutConfig rollout LossTerm losses with_alphas TuneConfig Evaluation Tuning
-        tune descend""",
+        PlanInputs Planned tune descend""",
     "store": "load_run load_walks",
     "verdict": "Score score Verdict make_verdict",
     "importing": "propose_robot standard_form",
+    "own": "program_of Walker walker_engine compare_plans compare_calls",
     "walk_tuning": "Campaign WalkTuning tune_on_walks",
     "export": "export",
     "report": "compare_runs write_film",
