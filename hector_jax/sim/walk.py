@@ -139,9 +139,12 @@ def _torques(config: WalkConfig, *layouts: Layout) -> Callable[..., Array]:
         motors, torque = step_actuators(robot, imperfections, motors, torque)
         return pack((torque, yaw, motors))
 
+    def small_call(*packed: Array) -> Array:
+        with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
+            return jax.jit(torques)(*packed)
+
     if jax.default_backend() == "cpu":
-        small = set_xla_metadata(xla_cpu_small_call="true", inlineable="false")
-        compiled = jax.jit(small(jax.jit(torques)))
+        compiled = jax.jit(small_call)
         with suppress(jax.errors.JaxRuntimeError):
             compiled(*(np.zeros(sum(leaf.size for leaf in leaves)) for _, leaves in layouts))
             return compiled
