@@ -10,13 +10,21 @@ import numpy as np
 import pytest
 from model import ANCHOR, BRIEF, PLAIN, ROBOT
 
+from hector_jax.cli.walker import _call_lines
 from hector_jax.control.controller import contacts_needed, plan
 from hector_jax.control.parameters import gradient_by_steps, step_names
 from hector_jax.control.reference import anchor_at, named_command
 from hector_jax.control.weights import nominal
 from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.inputs import InputError
-from hector_jax.own.planner import _closest, call_planner, compare_calls, plan_inputs
+from hector_jax.own.planner import (
+    _closest,
+    call_planner,
+    called_plans,
+    compare_calls,
+    distance_to_log,
+    plan_inputs,
+)
 from hector_jax.own.program import program_of
 from hector_jax.own.walk_log import at_ticks, log_of, trajectory_of
 from hector_jax.sim.loop import Job
@@ -24,9 +32,12 @@ from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.called import Planned, call_along
 from hector_jax.tuning.curvature import least_squares_jit
+from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
 from hector_jax.tuning.loss import PAPER_LOSS
 from hector_jax.tuning.rollout import Scenario
+from hector_jax.walk_tuning import walks
+from hector_jax.walk_tuning.campaign import Campaign
 
 ROLLOUT = replace(BRIEF, ticks=25)
 CONFIG, COMMAND, WEIGHTS = BRIEF.walk, named_command("s"), nominal()
@@ -207,6 +218,9 @@ def test_a_memory_and_jumps_of_a_planner_are_told(walked):
     found = compare_calls(warm, CONFIG, ROBOT, inputs, walked)
     assert found.again > 0.1
     assert found.jumps > 0.1
+    text = "\n".join(_call_lines(found))
+    assert "the plan has a memory, such as a warm start or a filter" in text
+    assert "of the plans jump when" in text
 
 
 def test_a_plan_that_is_not_solved_is_not_used(walked):
@@ -222,3 +236,26 @@ def test_a_plan_that_is_not_solved_is_not_used(walked):
     assert [*np.flatnonzero(~called.made)] == [3]
     assert np.isfinite(called.slopes).all()
     assert np.isfinite(called.values).all()
+    never = lambda asked: Planned(*np.full((3, *asked.contact.shape, 3), np.nan))  # noqa: E731
+    with pytest.raises(InputError, match="the planner solves no plan of a walk"):
+        called_plans(never, CONFIG, inputs)
+
+
+def test_a_planner_that_is_not_that_of_the_walk_is_noticed_before_a_tuning(walked):
+    inputs = plan_inputs(CONFIG, ROBOT, WEIGHTS, COMMAND, walked)
+    away = [
+        distance_to_log(answers(walked, lambda x, k=k: k * x), CONFIG, inputs, walked)
+        for k in (1.0, -1.0)
+    ]
+    assert away[0] == 0.0
+    assert away[1] == pytest.approx(2.0 * np.abs(walked.command.force[1:]).max(), rel=1e-6)
+
+
+def test_a_walk_of_which_a_planner_gives_no_plans_has_no_slope(walked, tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text("raise SystemExit('no solver')")
+    config = replace(TuneConfig(), rollout=ROLLOUT)
+    planner = program_of(path, 20.0)
+    one = Campaign(tmp_path, config, ROBOT, WEIGHTS, {"s": COMMAND}, planner=planner)
+    error = walks._slope(one, WEIGHTS, 0, log_of(walked))
+    assert str(error) == f"{path}: ended with code 1: no solver"

@@ -346,6 +346,29 @@ def test_a_fall_is_a_bounded_loss_of_its_case_and_has_no_slope(toy):
     assert float(objective.slope(at)[0].fallen) == 1.0  # it falls in more cases than the start
 
 
+def test_a_walk_whose_planner_fails_has_no_slope_and_the_others_steer(toy, monkeypatch, capsys):
+    """From the start on there has to be one; later a set without any is refused."""
+    failing, error = {1}, InputError("plans.py: ended with code 1")
+
+    def slope(campaign, weights, case, log):
+        return error if case in failing else toy_slope(campaign, weights, case, log)
+
+    monkeypatch.setattr(walks, "_slope", slope)
+    one, at = toy(cases=3), nominal()
+    objective = walks._Walks(HERE, one, partial(asked, cases=3))
+    found, _ = objective.slope(at)
+    assert "a walk without its slope: plans.py: ended with code 1" in capsys.readouterr().err
+    slopes = [toy_slope(one, at, c, LOG)[0] for c in (0, 2)]
+    shares = [float(found.loss) / 3.0 / toy_loss(at, c) for c in (0, 2)]
+    vectors = [np.asarray(weights_to_vector(each.gradient)) for each in slopes]
+    expected = sum(share * x for share, x in zip(shares, vectors, strict=True))
+    np.testing.assert_allclose(weights_to_vector(found.gradient), expected, rtol=1e-12)
+    failing.update(range(3))
+    assert float(objective.slope(at)[0].fallen) == 1.0
+    with pytest.raises(InputError, match=r"plans\.py: ended with code 1"):
+        walks._Walks(HERE, one, partial(asked, cases=3)).slope(at)
+
+
 def test_a_set_that_falls_in_more_cases_than_the_start_is_refused(toy):
     """Though its loss is lower; the shorter steps that follow are taken if they stand."""
 

@@ -42,12 +42,8 @@ _CALL_FLAGS = ("config", "out", "resume")
 # flags that may change when a run is resumed
 _FREE_FLAGS = (
     *("cluster", "data", "json", "processes", "video"),
-    *(
-        "walker",
-        "walker_limit",
-        "walker_uses",
-        "planner",
-    ),  # the record of its walks tells what it is
+    *("walker", "walker_limit", "walker_uses"),  # the record of its walks tells what it is
+    "planner",  # of which walks do not depend: it may be mended in between
 )
 # flags that say nothing to a program of the user
 _OF_OUR_CONTROLLER = "alpha data iterations net safe smooth variant".split()

@@ -82,12 +82,13 @@ def run_twin(args: Twin) -> None:
 def _call_lines(calls: Calls) -> Iterator[str]:
     """Return what of a planner a tuning cannot use."""
     if calls.again > 1e-6:
-        text = "a second call at the same inputs differs by"
+        text = "called in reverse order its plans differ by"
         yield f"{text} {calls.again:.2g}: the plan has a memory, such as a warm start or a filter"
     if calls.fit:
-        yield f"to {calls.fitted:.2g} they are those of the log if they are {', '.join(calls.fit)}"
+        yield f"its plans are those of the log, to {calls.fitted:.2g}, {' and '.join(calls.fit)}"
     if calls.jumps:
-        yield f"{100 * calls.jumps:.0f} % of the plans jump when a state is moved by 0.1 mm"
+        share = 100 * calls.jumps
+        yield f"{share:.0f} % of the plans jump when a state or a foot is moved by 0.1 mm or so"
     if calls.idle:
         yield f"no plan depends on {', '.join(calls.idle)}"
     if not calls.steps:

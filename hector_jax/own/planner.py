@@ -109,9 +109,12 @@ def called_plans(call: CallPlans, config: WalkConfig, inputs: PlanInputs) -> Cal
         inputs: from `plan_inputs`.
 
     Raises:
-        InputError: see `call_planner`.
+        InputError: see `call_planner`; or no plan is solved.
     """
-    return call_along(call, inputs, plans_at(config, inputs))
+    called = call_along(call, inputs, plans_at(config, inputs))
+    if not called.made.any():
+        raise InputError("the planner solves no plan of a walk: all its rows have NaN")
+    return called
 
 
 def plans_at(config: WalkConfig, inputs: PlanInputs) -> Bool[np.ndarray, " T"]:
@@ -190,7 +193,7 @@ def compare_calls(
         walk: the log.
 
     Raises:
-        InputError: see `call_planner`.
+        InputError: see `called_plans`.
     """
     first = called_plans(call, config, inputs)
     # another order, in which a plan that rests on the one before it is another

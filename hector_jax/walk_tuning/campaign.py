@@ -28,7 +28,7 @@ class Campaign:
     commands: Mapping[str, Command]
     plants: Sequence[Imperfections | None] = (None,)  # None: the walks are made elsewhere
     engine: Engine = MUJOCO_C
-    planner: Program | None = None  # of the user, whose slopes are taken; None: the robot's file
+    planner: Program | None = None  # that slopes are by; None: the controller of the robot's file
 
     def __post_init__(self) -> None:
         start = jax.tree.map(np.asarray, init(self.config, self.start).start)

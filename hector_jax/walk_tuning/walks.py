@@ -232,9 +232,9 @@ class _Walks:
         some = [logs[case].log for case in on]
         found = list(self.pool.map(_slope, repeat(campaign), repeat(weights), on, some))
         errors = [x for x in found if isinstance(x, InputError)]
+        if errors and len(errors) == len(found) and not number:
+            raise errors[0]
         for error in errors:
-            if len(errors) == len(found) and not number:
-                raise error
             say(f"a walk without its slope: {error}")
         slopes = [x for x in found if not isinstance(x, InputError)]
         usable = [x for x in slopes if step_status(campaign.config, x[0]) == StepStatus.ACCEPTED]
