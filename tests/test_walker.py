@@ -167,6 +167,14 @@ def test_a_program_that_makes_no_walk_is_told_in_one_line(tmp_path, text, told):
     assert told in str(error.value)
 
 
+def test_a_roll_that_stays_is_an_exchanged_angle_and_one_at_the_end_a_fall(tmp_path):
+    lean = "log['state.euler'][{}:, 0] = 0.9\n" + WRITE
+    fell = walked(program(tmp_path, lean.format(-1)))
+    assert [*np.flatnonzero(fell.fallen)] == [len(fell.fallen) - 1]
+    with pytest.raises(InputError, match="is it yaw, pitch, roll"):
+        walked(program(tmp_path, lean.format(5)))
+
+
 def test_in_a_tuning_a_walk_that_is_not_made_is_a_fall(tmp_path, capsys):
     walker = engine(program(tmp_path, "raise SystemExit('no solver')"), strict=False)
     job = Job(nominal(ROBOT), AHEAD, hfs(ROBOT.description), SECONDS)
