@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from model import BEST_OTHERS, EXAMPLES, ROBOT, small_net
-from pretend import call, files, instead, python, refused
+from pretend import HandsOver, call, files, instead, python, refused
 from synthetic import synthetic_walk
 
 from hector_jax.cli import arguments, doctor
@@ -198,6 +198,12 @@ def test_a_step_with_settings_of_its_own_leaves_what_a_tuning_reads(monkeypatch,
     for line in ("", "--engine c", "--walks 128", "--walks 128 --out data/walks"):
         assert call(monkeypatch, "steps", "collect", *line.split()) == 0
     assert list(map(str, paths)) == ["data/walks"] * 2 + ["data/walks-walks-128", "data/walks"]
+
+
+def test_walks_of_other_settings_are_refused_before_anything_is_compiled(monkeypatch, named):
+    monkeypatch.setattr(nets, "compile_programs", None)
+    with pytest.raises(InputError, match=f"^{named / 'walks'}: made"):
+        nets.collect_walks(HandsOver(), CollectConfig(walks=5), ROBOT, named / "walks")
 
 
 @pytest.mark.slow
