@@ -183,10 +183,10 @@ def answers(walked, change=lambda x: x):
 def test_another_convention_of_the_plans_is_found(walked, change, fit):
     inputs = plan_inputs(CONFIG, ROBOT, WEIGHTS, COMMAND, walked)
     calls = compare_calls(answers(walked, change), CONFIG, ROBOT, inputs, walked)
-    assert calls.fit == fit
+    assert calls.convention == fit
     assert calls.parity.plans == len(inputs.time)
-    assert calls.idle == step_names(WEIGHTS)
-    assert (calls.again, calls.jumps, calls.steps) == (0.0, 0.0, True)
+    assert calls.unused_weights == step_names(WEIGHTS)
+    assert (calls.memory, calls.jumps, calls.touchdowns_follow) == (0.0, 0.0, True)
 
 
 @pytest.mark.parametrize(("axes", "into"), [*product(("heading", "trunk"), (True, False))])
@@ -216,7 +216,7 @@ def test_a_memory_and_jumps_of_a_planner_are_told(walked):
         return plans._replace(force=plans.force + 0.1 * before + jump)
 
     found = compare_calls(warm, CONFIG, ROBOT, inputs, walked)
-    assert found.again > 0.1
+    assert found.memory > 0.1
     assert found.jumps > 0.1
     text = "\n".join(_call_lines(found))
     assert "the plan has a memory, such as a warm start or a filter" in text

@@ -22,7 +22,7 @@ from hector_jax.own.log_check import check_log, read_check
 from hector_jax.own.parity import COMPONENTS, Parity, compare_plans
 from hector_jax.own.planner import (
     JUMP,
-    Calls,
+    CallCheck,
     call_planner,
     compare_calls,
     distance_to_log,
@@ -79,19 +79,20 @@ def run_twin(args: Twin) -> None:
     print_result(args.json, result, lambda: print(*lines, sep="\n"))
 
 
-def _call_lines(calls: Calls) -> Iterator[str]:
+def _call_lines(calls: CallCheck) -> Iterator[str]:
     """Return what of a planner a tuning cannot use."""
-    if calls.again > 1e-6:
+    if calls.memory > 1e-6:
         text = "called in reverse order its plans differ by"
-        yield f"{text} {calls.again:.2g}: the plan has a memory, such as a warm start or a filter"
-    if calls.fit:
-        yield f"its plans are those of the log, to {calls.fitted:.2g}, {' and '.join(calls.fit)}"
+        yield f"{text} {calls.memory:.2g}: the plan has a memory, such as a warm start or a filter"
+    if calls.convention:
+        told = " and ".join(calls.convention)
+        yield f"its plans are those of the log, to {calls.distance:.2g}, {told}"
     if calls.jumps:
         share = 100 * calls.jumps
         yield f"{share:.0f} % of the plans jump when a state or a foot is moved by 0.1 mm or so"
-    if calls.idle:
-        yield f"no plan depends on {', '.join(calls.idle)}"
-    if not calls.steps:
+    if calls.unused_weights:
+        yield f"no plan depends on {', '.join(calls.unused_weights)}"
+    if not calls.touchdowns_follow:
         yield "no touchdown depends on the velocity: a robot that steps so would fall"
 
 

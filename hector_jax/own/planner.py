@@ -135,16 +135,16 @@ def distance_to_log(
     return float(np.nanmax(away, initial=0.0))
 
 
-class Calls(NamedTuple):
+class CallCheck(NamedTuple):
     """What calling a planner along a log shows."""
 
     parity: Parity  # of the plans by call, in place of those of a twin
-    again: float  # [N, N m] largest difference between two calls, the other one in reverse order
+    memory: float  # [N, N m] largest difference between two calls, the other one in reverse order
     jumps: float  # share of the plans that jump when a state or a foot is moved a little
-    idle: tuple[str, ...]  # names of the weights that change no plan
-    steps: bool  # whether the touchdowns follow the velocity
-    fit: tuple[str, ...]  # what makes the plans those of the log, if they are not; see `_closest`
-    fitted: float  # [N, N m] largest difference then
+    unused_weights: tuple[str, ...]  # names of the weights that change no plan
+    touchdowns_follow: bool  # whether the touchdowns follow the velocity
+    convention: tuple[str, ...]  # that makes them those of the log, see `_closest`
+    distance: float  # [N, N m] largest difference then
 
 
 def _closest(
@@ -183,7 +183,7 @@ def _closest(
 
 def compare_calls(
     call: CallPlans, config: WalkConfig, robot: Robot, inputs: PlanInputs, walk: Trajectory
-) -> Calls:
+) -> CallCheck:
     """Call a controller along a log, and compare its plans with the commands of the log.
 
     Args:
@@ -218,14 +218,15 @@ def compare_calls(
     weight = float(robot.mass * np.linalg.norm(robot.gravity))
     names = direction_names(inputs.weights)
     stands = np.asarray(inputs.contact)[rows]
-    fit, fitted = _closest(logged[rows], called[rows], inputs.state.euler[rows], stands)
-    idle = np.abs(by_weights).max(axis=(0, 1, 2)) == 0.0
-    return Calls(
+    euler = inputs.state.euler[rows]
+    convention, distance = _closest(logged[rows], called[rows], euler, stands)
+    unused = np.abs(by_weights).max(axis=(0, 1, 2)) == 0.0
+    return CallCheck(
         parity,
-        again=float(np.nanmax(np.abs(again))),
+        memory=float(np.nanmax(np.abs(again))),
         jumps=float(np.mean(changes.max(axis=1) > JUMP * weight)),
-        idle=tuple(name for name, none in zip(names, idle, strict=True) if none),
-        steps=bool(np.any(by_body[..., 6:8, 9:11])),
-        fit=fit,
-        fitted=fitted,
+        unused_weights=tuple(name for name, none in zip(names, unused, strict=True) if none),
+        touchdowns_follow=bool(np.any(by_body[..., 6:8, 9:11])),
+        convention=convention,
+        distance=distance,
     )
