@@ -14,7 +14,7 @@ from hector_jax.control.controller import (
     actuate,
     contacts_needed,
     init_memory,
-    limit_distance,
+    limit_errors,
     measured_feet,
     plan,
     plan_horizon,
@@ -192,9 +192,14 @@ def test_an_error_beyond_the_limit_counts_as_the_limit():
     away = state._replace(position=state.position + jnp.array([0.3, -0.4, 0.02]))
     ahead = State(*jnp.zeros((4, 3, 3)))
     horizon = Horizon(ahead, ahead.euler, *[jnp.zeros((3, 2))] * 2, jnp.ones((3, 2), bool))
-    moved = limit_distance(horizon, away, state, 0.1).reference
+    moved = limit_errors(horizon, away, state, 0.1).reference
     np.testing.assert_allclose(moved.position, [[0.24, -0.32, 0.0]] * 3, atol=1e-9)
-    place = lambda x: limit_distance(horizon, x, state, np.inf).reference.position  # noqa: E731
+    np.testing.assert_array_equal(moved.euler, 0.0)
+    for yaw, shift in ((2.0, 1.7), (0.25, 0.0), (-0.5, -0.2)):
+        turned = state._replace(euler=jnp.array([0.1, 0.2, yaw]))
+        euler = limit_errors(horizon, turned, state, np.inf, 0.3).reference.euler
+        np.testing.assert_allclose(euler, [[0.0, 0.0, shift]] * 3, atol=1e-9)
+    place = lambda x: limit_errors(horizon, x, state, np.inf).reference.position  # noqa: E731
     unlimited = jax.grad(lambda x: place(x)[0, 0])
     assert not any(part.any() for part in unlimited(state))  # and is finite without an error
 

@@ -51,6 +51,20 @@ def test_what_a_push_leaves_counts_less_than_a_steady_error():
     assert (counts(0.3) < counts(0.02)).all()
 
 
+def test_what_is_missing_has_a_bound():
+    """As it integrates on a stand, 2 cm above the floor and at a standstill."""
+    held = AT_REST._replace(position=np.array([0.0, 0.0, 0.02]), euler=np.array([0.05, 0.0, 0.0]))
+    gains = INTEGRAL._replace(limit=4.9)
+    found = NO_DISTURBANCE
+    for _ in range(100):
+        found = integrate(gains, found, held, AT_REST, 1.0)
+    np.testing.assert_allclose(found.linear, [0.0, 0.0, 4.9])
+    np.testing.assert_allclose(found.angular, [49.0, 0.0, 0.0])
+    one = integrate(gains, NO_DISTURBANCE, held, AT_REST, 0.01)
+    free = integrate(INTEGRAL, NO_DISTURBANCE, held, AT_REST, 0.01)
+    jax.tree.map(np.testing.assert_array_equal, one, free)
+
+
 def test_steady_errors_go():
     """On ground that returns 90 % of the forces, and a moment that the model does not have."""
     walk, last = jax.jit(rollout, static_argnums=0), []

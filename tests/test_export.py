@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.problems import draw_problems, layer_qp, pick
 from hector_jax.cli.flags import Tune
 from hector_jax.cli.parse import as_table
-from hector_jax.control.contact import LINE_FRICTION, StateCost
+from hector_jax.control.contact import LINE_FRICTION, InputConstraint, StateCost
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
@@ -292,16 +292,16 @@ def test_measured_yaw_and_anchor_may_be_of_any_turn(library):
 
 def test_what_is_no_number_has_a_status_and_the_torques_of_the_call_before(library, walked):
     """Also in the millisecond of a plan, which is then made in the next."""
-    inputs, lost = inputs_of(walked, ROBOT), [0, 3, 500, 501]
-    inputs.estimate["euler"][[0, 500], 2] = np.nan
+    inputs, lost = inputs_of(walked, ROBOT), [3, 500, 501]
+    inputs.estimate["euler"][500, 2] = np.nan
     inputs.estimate["joints"][3, 0], inputs.estimate["position"][501, 1] = np.inf, -np.inf
     out = answers(library, inputs)
     assert np.flatnonzero(out["status"] == BAD_INPUT).tolist() == lost
-    assert not out["torque"][0].any()
     np.testing.assert_array_equal(out["torque"][500:502], out["torque"][[499, 499]])
     np.testing.assert_array_equal(out["force"][500:502], out["force"][[499, 499]])
     assert np.abs(out["force"][502] - out["force"][499]).max() > 1e-6  # planned
     np.testing.assert_allclose(out["torque"][502:], walked.torque[502:], atol=1.0)
+    assert out["age"][[499, 501, 502, 510]].tolist() == [9, 11, 2, 0]
 
 
 @pytest.mark.parametrize(
@@ -310,11 +310,12 @@ def test_what_is_no_number_has_a_status_and_the_torques_of_the_call_before(libra
         ("command", "duration", 6.9e-310),  # what memory that nobody filled in holds
         ("command", "duration", 1e7),
         ("command", "velocity", 1e308),
-        ("command", "velocity", 1e7),
-        ("command", "yaw_rate", -1e7),
+        ("command", "velocity", 10.1),
+        ("command", "yaw_rate", -10.1),
         ("anchor", "position", np.nan),
         ("anchor", "position", 1e100),
         ("anchor", "yaw", 6e15),
+        ("anchor", "tick", -(2**63)),
         ("estimate", "joint_rates", np.inf),
         ("estimate", "joint_rates", 1e308),
         ("estimate", "velocity", 1e307),
@@ -325,21 +326,39 @@ def test_what_is_no_number_has_a_status_and_the_torques_of_the_call_before(libra
         ("command", "yaw_rate", np.nan),
     ],
 )
-def test_a_refused_call_leaves_all_but_the_time_as_it_was(library, walked, part, name, value):
-    bad, seen = 1240, []
-    inputs = Inputs(*(np.resize(rows, len(walked.torque)) for rows in inputs_of(walked, ROBOT)))
-    getattr(inputs, part)[name][bad] = value
+def test_refused_calls_between_change_nothing(library, walked, part, name, value):
+    """No bit of the memory, so that the walk is the same to the last one."""
+    inputs = inputs_of(walked, ROBOT)
+    inputs = inputs._replace(estimate=inputs.estimate[:1300], anchor=inputs.anchor[:1300])
+    wrong, out = Inputs(*map(np.copy, inputs)), np.zeros(1300, check.layout_of(ROBOT).output)
+    getattr(wrong, part)[name][:] = value
 
-    def look(i, compiled):
-        if i in (bad, bad + 1):
-            seen.append(np.frombuffer(compiled.memory.raw, "u8"))
+    def refuse(i, compiled):
+        if i % 13 == 0:
+            memory = compiled.memory.raw
+            compiled.step(wrong, out, i)
+            assert out["status"][i] == BAD_INPUT
+            assert compiled.memory.raw == memory
 
-    out = answers(library, inputs, look)
-    assert np.flatnonzero(out["status"]).tolist() == [bad]
-    assert out["status"][bad] == BAD_INPUT
-    (changed,) = np.flatnonzero(seen[0] != seen[1])  # the count of milliseconds
-    assert seen[1][changed] == seen[0][changed] + 1
-    np.testing.assert_allclose(out["torque"][bad + 1 :], walked.torque[bad + 1 :], atol=1.0)
+    np.testing.assert_array_equal(answers(library, inputs, refuse), answers(library, inputs))
+    assert not out["torque"][0].any()  # before the first good call
+
+
+@pytest.fixture(scope="module")
+def own_tests(library):
+    """The functions of exported_calls.c, compiled beside a controller, by their names."""
+    words = [*"cc -std=c99 -O2 -fPIC -shared -I. -o calls.so".split(), HERE / "exported_calls.c"]
+    subprocess.run([*words, "controller.c", "-lm"], cwd=library.parent, check=True)
+    return ctypes.CDLL(str(library.parent / "calls.so"))
+
+
+CALLS = re.findall(r"^int test_(\w+)\(", (HERE / "exported_calls.c").read_text(), re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_calls_of_the_controller(own_tests, name):
+    """Each returns the line of its first failure."""
+    assert getattr(own_tests, f"test_{name}")() == 0
 
 
 @pytest.mark.parametrize("flag", ["-ffast-math", "-Ofast"])
@@ -533,9 +552,11 @@ def test_weights_that_fall_and_constraints_of_ones_own_are_refused():
     limp = TUNED._replace(Q=jax.tree.map(lambda w: 1e-6 * w, nominal().Q))
     with pytest.raises(ValueError, match="fall"):
         walk_of(named_command("straight"), 0.2, limp)
-    own = replace(CONFIG, mpc=MpcConfig(costs=(StateCost("low", of=None),)))
-    with pytest.raises(ValueError, match="no costs beside Q and R, got low"):
-        source_of(TUNED, own)
+    own = MpcConfig(costs=(StateCost("low", of=None),))
+    named_as_ours = (*CONFIG.mpc.constraints, InputConstraint("friction", of=lambda contact: None))
+    for mpc, name in ((own, "low"), (MpcConfig(constraints=named_as_ours), "friction")):
+        with pytest.raises(InputError, match=f"functions in Python.*has none: {name}; it has"):
+            source_of(TUNED, replace(CONFIG, mpc=mpc))
 
 
 # The command

@@ -15,21 +15,11 @@
 #include "controller.h"
 
 static const char *joint_names[CONTROLLER_JOINTS] = CONTROLLER_JOINT_NAMES;
-static const double com[3] = CONTROLLER_COM;
 static struct controller controller;
 
 /* On a robot: the state estimate. */
 static void measure(const mjModel *m, const mjData *d, struct controller_estimate *e) {
-    mjtNum R[9], offset[3], spin[3];
-    mju_quat2Mat(R, d->qpos + 3);
-    mju_mulMatVec3(offset, R, com);
-    mju_mulMatVec3(e->ang_velocity, R, d->qvel + 3);
-    mju_cross(spin, e->ang_velocity, offset);
-    mju_add3(e->position, d->qpos, offset);
-    mju_add3(e->velocity, d->qvel, spin);
-    e->euler[0] = atan2(R[7], R[8]);
-    e->euler[1] = asin(mju_clip(-R[6], -1, 1));
-    e->euler[2] = atan2(R[3], R[0]);
+    controller_from_imu(d->qpos + 3, d->qvel + 3, d->qpos, d->qvel, e);
     for (int i = 0; i < CONTROLLER_JOINTS; ++i) {
         int joint = mj_name2id(m, mjOBJ_JOINT, joint_names[i]);
         e->joints[i] = d->qpos[m->jnt_qposadr[joint]];
@@ -42,9 +32,6 @@ int main(int count, char **words) {
     mjModel *m = count == 3 ? mj_loadXML(words[1], NULL, error, sizeof error) : NULL;
     if (!m) return fprintf(stderr, "%s\n", error), 2;
     mjData *d = mj_makeData(m);
-    /* a turn of 0.5 rad/s at 0.3 m/s; to step in place before it, the anchor's tick is far ahead */
-    struct controller_command command = { 1, { 4.0 }, { { 0.3, 0.0 } }, { 0.5 } };
-    struct controller_anchor anchor = { { 0, 0, CONTROLLER_STANDING_HEIGHT }, 0, INT32_MAX };
     struct controller_estimate estimate;
     struct controller_output output;
     int unsolved = 0;
@@ -52,14 +39,11 @@ int main(int count, char **words) {
     controller_init(&controller);
     for (int ms = 0; ms < CONTROLLER_TICK_0 + (int)(1000 * atof(words[2])); ++ms) {
         measure(m, d, &estimate);
-        if (ms == CONTROLLER_TICK_0) { /* begin the command here and now */
-            mju_copy(anchor.position, estimate.position, 2);
-            anchor.yaw = estimate.euler[2];
-            anchor.tick = 0;
-        }
-        controller_step(&controller, &estimate, &command, &anchor, &output);
+        if (ms == CONTROLLER_TICK_0) /* before, it steps in place */
+            controller_drive(&controller, 0.3, 0.0, 0.5);
+        controller_step(&controller, ms, &estimate, NULL, NULL, &output);
         if (output.status != CONTROLLER_SOLVED && output.status != CONTROLLER_NOT_UNIQUE)
-            ++unsolved; /* on a robot: hold, sit down or stop */
+            ++unsolved; /* on a robot: see docs/export.md */
         mju_copy(d->ctrl, output.torque, CONTROLLER_JOINTS); /* on a robot: to its motors */
         mj_step(m, d);
     }

@@ -8,7 +8,7 @@ robot, never the parameters of the plant.
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -204,23 +204,29 @@ def plan_horizon(
     return horizon, current, touchdowns[0]
 
 
-def limit_distance(
-    horizon: Horizon, state: State, reference: State, limit: float | Float[Array, ""]
+def limit_errors(
+    horizon: Horizon, state: State, reference: State, position: Any, yaw: Any = np.inf
 ) -> Horizon:
-    """Shift the reference horizontally so that it is at most `limit` [m] away from the robot now.
+    """Shift and turn the reference so that it is at most so far away from the robot now.
 
-    A push or a slip moves the robot further than tracking ever does. Weights that track tightly
-    would ask for all the friction there is to pull it back, and it would fall.
+    A push, a slip or a hand moves the robot further than tracking ever does. Weights that track
+    tightly would ask for all the friction there is to pull it back, and it would fall.
 
     Args:
         horizon: of the MPC.
         state, reference: current and desired base state.
-        limit: largest distance; infinite: no shift.
+        position: largest horizontal distance [m]; infinite: no shift.
+        yaw: largest heading error [rad].
     """
     away = (state.position - reference.position).at[2].set(0.0)
     distance = jnp.sqrt(jnp.sum(away**2) + 1e-12)  # has a derivative at zero
-    shift = away * (jnp.maximum(distance - limit, 0.0) / distance)
-    moved = horizon.reference._replace(position=horizon.reference.position + shift)
+    shift = away * (jnp.maximum(distance - position, 0.0) / distance)
+    error = state.euler[2] - reference.euler[2]
+    wanted = horizon.reference
+    moved = wanted._replace(
+        position=wanted.position + shift,
+        euler=wanted.euler.at[:, 2].add(error - jnp.clip(error, -yaw, yaw)),
+    )
     return horizon._replace(reference=moved)
 
 
@@ -270,11 +276,13 @@ def plan(
         desired=desired,
     )
     dt, every = config.gait.tick, config.twin.plan_ticks
-    horizon = limit_distance(horizon, state, reference, parameters.mpc.position_limit)
-    disturbance = integrate_error(parameters.mpc.integral, disturbance, state, reference, dt)
+    limits = parameters.mpc.position_limit, parameters.mpc.yaw_limit
+    horizon = limit_errors(horizon, state, reference, *limits)
+    contact, swing_ticks = gait.contact(config.gait, tick), gait.swing_ticks(config.gait, tick)
+    loaded = dt * jnp.any(contact)
+    disturbance = integrate_error(parameters.mpc.integral, disturbance, state, reference, loaded)
     body = config.twin.body(robot)
     problem = MpcProblem(body, parameters.mpc, state, horizon, disturbance)
-    contact, swing_ticks = gait.contact(config.gait, tick), gait.swing_ticks(config.gait, tick)
     solve = partial(solve_mpc, config.mpc, problem, dt=config.mpc_step, max_contacts=max_contacts)
     held = last is not None and every > 1
     wrench, solution = _solve_or_keep(solve, last, tick % every == 0) if held else solve()

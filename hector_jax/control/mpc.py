@@ -55,7 +55,8 @@ class MpcParameters(NamedTuple):
     friction: Any  # mu
     max_force: Any  # [N] per foot
     effort_reference: Any  # share of the robot's weight in the force reference of R
-    position_limit: Any  # [m] see `controller.limit_distance`
+    position_limit: Any  # [m] see `controller.limit_errors`
+    yaw_limit: Any  # [rad] as above
     integral: IntegralGains
     costs: Mapping[str, Any] = {}  # factors on the weights of the own costs, by name
 
@@ -80,11 +81,13 @@ class MpcConfig:
     line_friction: bool = True  # False removes LINE_FRICTION from the constraints
     effort_reference: str = "zero"  # cost on u (paper); "gravity": on u minus the weight's share
     position_limit: float | None = None  # [m] largest horizontal error that counts; None: any
+    yaw_limit: Annotated[float, POSITIVE] = 0.3  # [rad] largest heading error that counts
     # [1/s^3] of `IntegralGains`, all four
     horizontal_gain: Annotated[float, NOT_NEGATIVE] = 0.0
     height_gain: Annotated[float, NOT_NEGATIVE] = 0.0
     tilt_gain: Annotated[float, NOT_NEGATIVE] = 0.0
     yaw_gain: Annotated[float, NOT_NEGATIVE] = 0.0
+    integral_limit: Annotated[float, POSITIVE] = 4.9  # [m/s^2] half the weight; see `IntegralGains`
     qp: QpConfig = QpConfig()
     contact: ContactModel = LINE_FOOT
     constraints: tuple[Constraint, ...] = ()  # none: those of the contact model
@@ -104,11 +107,13 @@ class MpcConfig:
 
     def parameters(self, weights: Weights) -> MpcParameters:
         """Return the traced numbers."""
-        gains = IntegralGains(self.horizontal_gain, self.height_gain, self.tilt_gain, self.yaw_gain)
+        gains = (self.horizontal_gain, self.height_gain, self.tilt_gain, self.yaw_gain)
+        integral = IntegralGains(*gains, self.integral_limit)
         limit = math.inf if self.position_limit is None else self.position_limit
         effort = float(self.effort_reference == "gravity")
         costs = {str(cost): 1.0 for cost in self.costs}
-        return MpcParameters(weights, self.friction, self.max_force, effort, limit, gains, costs)
+        forces = (self.friction, self.max_force, effort)
+        return MpcParameters(weights, *forces, limit, self.yaw_limit, integral, costs)
 
     def planned_inertia(self, inertia: Float[Any, "3 3"]) -> Float[Any, "3 3"]:
         """Return the inertia [kg m^2] that the plan turns, from that of the whole robot."""

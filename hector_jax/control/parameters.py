@@ -103,6 +103,8 @@ TUNABLES = {
     "yaw_gain": Tunable("mpc.integral.yaw", 0.0, 1000.0),
     "friction": Tunable("mpc.friction", 0.1, 1.0),
     "position_limit": Tunable("mpc.position_limit", 1e-3, 10.0),
+    "yaw_limit": Tunable("mpc.yaw_limit", 1e-2, 10.0),
+    "integral_limit": Tunable("mpc.integral.limit", 1e-2, 20.0),
     "gravity_compensation": Tunable("legs.gravity_compensation", 0.0, 1.0),
     "foot_height": Tunable("legs.height", 0.02, 0.2),
     "landing": Tunable("legs.landing", -0.05, 0.05),

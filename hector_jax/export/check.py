@@ -159,7 +159,8 @@ def layout_of(robot: Robot, pieces: int = PIECES) -> Layout:
     numbers = {"duration": (), "velocity": (2,), "yaw_rate": ()}
     command = [(name, "f8", (pieces, *shape)) for name, shape in numbers.items()]
     output = [("torque", "f8", joints), ("force", "f8", (feet, 3)), ("moment", "f8", (feet, 3))]
-    output += [("residual", "f8"), ("contact", "i4", feet), ("iterations", "i4"), ("status", "i4")]
+    output += [(name, "f8") for name in ("residual", "tilt", "height", "margin")] + [("age", "i8")]
+    output += [("contact", "i4", feet), ("iterations", "i4"), ("status", "i4")]
     parts = (
         [*vectors, ("joints", "f8", joints), ("joint_rates", "f8", joints)],
         [("pieces", "i4"), *command],
@@ -208,7 +209,7 @@ class Library:
         self.functions.controller_init(self.memory)
 
     def step(self, inputs: Inputs, output: np.ndarray, row: int) -> float:
-        """Take the step of a row of the inputs and write the row of the output.
+        """Take the step of a row of the inputs, its millisecond, and write the row of the output.
 
         Returns:
             The thread's CPU time [ms].
@@ -216,7 +217,7 @@ class Library:
         at = [x.ctypes.data + min(row, len(x) - 1) * x.itemsize for x in (*inputs, output)]
         pointers = [ctypes.c_void_p(address) for address in at]
         begin = time.thread_time_ns()
-        self.functions.controller_step(self.memory, *pointers)
+        self.functions.controller_step(self.memory, ctypes.c_int64(row), *pointers)
         return 1e-6 * (time.thread_time_ns() - begin)
 
 

@@ -6,6 +6,7 @@ then `legs`, `qp` and `mpc`. What is filled in are sizes, tables and the constra
 
 import hashlib
 import json
+import re
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
@@ -16,15 +17,18 @@ import jax.numpy as jnp
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from hector_jax.control.contact import Constraint
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.footstep import FootstepConfig
-from hector_jax.control.parameters import TUNABLES
+from hector_jax.control.parameters import TUNABLES, Q, R
 from hector_jax.control.twin import TwinConfig
 from hector_jax.control.weights import Weights
-from hector_jax.control.weights_file import WEIGHTS
-from hector_jax.core.geometry import inverse
+from hector_jax.core.environment import versions
+from hector_jax.core.files import as_json
 from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import to_table
 from hector_jax.core.trajectory import FEET
+from hector_jax.core.tree_file import tree_hash
 from hector_jax.robot.kinematics import NEWTON_STEPS
 from hector_jax.robot.model import Robot
 from hector_jax.sim.loop import first_tick, substeps
@@ -34,6 +38,7 @@ from hector_jax.sim.loop import first_tick, substeps
 # default. The formulas are those of `control.contact`; cs and sn are of the foot's yaw.
 _SIDES = {
     "friction": ["1, 1, -mu", "-1, -1, -mu", "1, -1, -mu", "-1, 1, -mu"],
+    "box_friction": ["cs, sn, -mu", "-cs, -sn, -mu", "-sn, cs, -mu", "sn, -cs, -mu"],
     "unilateral_force": ["0, 0, -1", "0, 0, 1, 0, 0, 0, MAX_FORCE"],
     "line_pressure": ["0, 0, -TOE, 0, -1", "0, 0, -HEEL, 0, 1"],
     "line_friction": [
@@ -43,6 +48,7 @@ _SIDES = {
         "TOE * sn, -TOE * cs, -grip * TOE, 0, -grip, 1",
     ],
     "side_pressure": [f"0, 0, -HALF_WIDTH, {s}" for s in (1, -1)],
+    "twist": [f"0, 0, -TWIST, 0, 0, {s}" for s in (1, -1)],
     "torsion": [f"0, 0, -0.5 * grip * DIAGONAL, 0, 0, {s}" for s in (1, -1)],
     "corner_friction": [
         *("cs, sn, -inner", "-cs, -sn, -inner", "-sn, cs, -inner", "sn, -cs, -inner"),
@@ -74,6 +80,7 @@ def controller_source(
     name: str,
     content: bytes,
     pieces: int = 0,
+    measured: str = "not measured",
 ) -> dict[str, str]:
     """Return `controller.c` and `controller.h` by their names.
 
@@ -82,6 +89,7 @@ def controller_source(
         name: of the weights, for the first line.
         content: of the weights file, whose sha256 is in the header.
         pieces: of a command, if more than PIECES.
+        measured: times of calls, for the header.
 
     Raises:
         InputError: constraints or costs of one's own, which are Python; or a twin.
@@ -90,19 +98,25 @@ def controller_source(
     ours = footsteps.travel, footsteps.ahead
     if config.twin != TwinConfig() or (config.footstep.travel, config.footstep.ahead) != ours:
         raise InputError("a twin is not exported, but a file of numbers is: --template")
-    constraints = [part.name for part in (*mpc.on("inputs"), *mpc.on("states"))]
-    own = [part for part in constraints if part not in _SIDES] + [c.name for c in mpc.costs]
+    parts = (*mpc.on("inputs"), *mpc.on("states"))
+    own = [part for part in parts if part not in Constraint.known] + list(mpc.costs)
     if own:
-        text = f"the C controller has the constraints {', '.join(_SIDES)} and no costs beside Q and"
-        raise InputError(f"{text} R, got {', '.join(own)}")
+        text = "constraints and costs of your own are functions in Python, and the C controller has"
+        listed = ", ".join(map(str, own))
+        raise InputError(f"{text} none: {listed}; it has {', '.join(_SIDES)}")
+    constraints = [str(part) for part in parts]
     sides = [side for part in constraints for side in _SIDES[part]]
     values = {
+        "version": versions().get("hector-jax", "of an unknown version"),
+        "robot": tree_hash(robot),
+        "settings": hashlib.sha256(as_json(to_table(config)).encode()).hexdigest(),
         "title": f"{robot.description.name} with the weights {name}".replace("*/", "* /"),
         "sha256": hashlib.sha256(content).hexdigest(),
         "feet": FEET[len(robot.foot_point)],
         "joints": robot.description.joints,
         "com": robot.com_offset,
         "height": float(robot.standing_height),
+        "fall": dict(zip(("height", "tilt"), robot.description.limits, strict=True)),
         "pieces": max(pieces, PIECES),
         "period": substeps(config),
         "lead": -first_tick(config) * substeps(config),
@@ -116,16 +130,34 @@ def controller_source(
         "tunables": dict(_tunables(config, robot, weights)),
     }
 
-    def render(id: str) -> dict[str, str]:
-        known = {**values, "c": _c, "id": id, "names": _NAMES}
+    def render(**others: str) -> dict[str, str]:
+        known = {**values, "c": _c, "names": _NAMES, **others}
         return {f: _TEMPLATES.get_template(f"{f}.j2").render(known) for f in FILES}
 
     # named by what they are: another export has other names in a program that links both
-    return render(hashlib.sha256("".join(render("").values()).encode()).hexdigest()[:12])
+    text = "".join(render(id="", measured="").values())
+    return render(id=hashlib.sha256(text.encode()).hexdigest()[:12], measured=measured)
 
 
 FILES = ("controller.h", "controller.c")
-_NAMES = ("size", "exported", "lower", "upper", "init", "reset", "set_tunables", "step")
+_NAMES = "size exported lower upper init reset set_tunables set_max_changes drive from_imu".split()
+_NAMES += ["plan", "hold", "step"]
+
+
+def with_prefix(source: dict[str, str], prefix: str) -> dict[str, str]:
+    """Return source in whose names, files and macros the word controller is another.
+
+    Raises:
+        InputError: it is no name in C.
+    """
+    if not re.fullmatch("[a-z][a-z0-9_]*", prefix):
+        raise InputError(f"--prefix must be a name in C in small letters, got {prefix!r}")
+    names = r"\bcontroller(?=_|\.[ch]\b)|(?<=struct )controller\b"
+
+    def rename(text: str) -> str:
+        return re.sub(r"\bCONTROLLER(?=_)", prefix.upper(), re.sub(names, prefix, text))
+
+    return {rename(file): rename(text) for file, text in source.items()}
 
 
 def _c(value: Any) -> str:
@@ -134,7 +166,7 @@ def _c(value: Any) -> str:
         return json.dumps(value)
     if np.ndim(value):
         return "{ " + ", ".join(map(_c, value)) + " }"
-    return "INFINITY" if value == np.inf else repr(np.asarray(value).item())
+    return "HUGE_VAL" if value == np.inf else repr(np.asarray(value).item())
 
 
 def _numbers(config: WalkConfig, robot: Robot) -> dict[str, Any]:
@@ -152,6 +184,7 @@ def _numbers(config: WalkConfig, robot: Robot) -> dict[str, Any]:
         "DT": config.mpc_step,
         "MASS": robot.mass,
         "MAX_FORCE": mpc.max_force,
+        "TWIST": mpc.twist,
         "TOE": robot.toe,
         "HEEL": robot.heel,
         "MIDDLE": 0.5 * (robot.toe - robot.heel),
@@ -175,7 +208,7 @@ def _tables(config: WalkConfig, robot: Robot) -> dict[str, Any]:
         "LEAD": np.rint(gait.cycle * np.array(gait.offsets)).astype(int),
         "COMPONENT": np.array(config.mpc.contact.components),
         "GRAVITY": robot.gravity,
-        "INVERSE_INERTIA": np.asarray(inverse(jnp.asarray(inertia))),
+        "INVERSE_INERTIA": np.linalg.inv(np.asarray(inertia, float)),
         "COM": robot.com_offset,
         "FOOT_AHEAD": robot.foot_ahead,
         "ORIGIN": robot.joint_origin,
@@ -214,6 +247,11 @@ def _sizes(config: WalkConfig, sides: int) -> dict[str, Any]:
         "sides": sides,
         "variables": variables,
         "limit": limit,
+        "kilobytes": round(
+            8e-3 * (variables * (4 * variables + 23) + contacts * sides * (model.inputs + 1))
+        )
+        + 2,
+        "stack": 14 + contacts * sides // 100,
         "usual": round(millions(usual, usual // 5, usual // 5), 1),
         "most": round(millions(variables, variables, limit)),
     }
@@ -224,15 +262,13 @@ def _tunables(
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the names of the tunables with the exported values and their bounds.
 
-    The bounds are those of a weights file, and further out if the exported value is.
+    The bounds are the box of the tuner, and further out if the exported value is.
     """
     parameters = jax.tree.map(np.asarray, config.parameters(weights))
     named = {"Q": np.concatenate(weights.Q), "R_force": weights.R.force}
     named |= {"R_moment": weights.R.moment} if weights.R.moment.size else {}
     named |= {name: tunable.read(parameters) for name, tunable in TUNABLES.items()}
     for name, value in named.items():
-        box = TUNABLES.get(name)
-        low, high = (box.lower, box.upper) if box else (WEIGHTS.low, WEIGHTS.high)
-        value = np.asarray(value, float)
-        edges = np.minimum(value, low), np.maximum(value, high)
+        box, value = TUNABLES.get(name, Q if name == "Q" else R), np.asarray(value, float)
+        edges = np.minimum(value, box.lower), np.maximum(value, box.upper)
         yield name, dict(zip(("exported", "lower", "upper"), (value, *edges), strict=True))

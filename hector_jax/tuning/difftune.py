@@ -94,9 +94,9 @@ def _why_not_tunable(walk: WalkConfig, name: str) -> str:
             f"{name} cannot be tuned by gradients: the rigid-body model has no joints, so its "
             "gradient is zero; a weights file can set it"
         )
-    if name == "position_limit":
+    if name in ("position_limit", "yaw_limit", "integral_limit"):
         return (
-            f"{name} cannot be tuned by gradients: the errors of a rollout are mostly below it, so "
+            f"{name} cannot be tuned by gradients: what it limits is mostly below it in a rollout, so "
             "that its gradient is mostly zero; a weights file or --safe can set it"
         )
     if tunable.path.startswith("footstep.") and walk.footstep.rule == "paper":
