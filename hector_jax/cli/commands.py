@@ -25,7 +25,7 @@ from hector_jax.importing.table import changes_of_model, section, table_of
 from hector_jax.robot.model import load_robot
 from hector_jax.sim import margin
 from hector_jax.store import nets
-from hector_jax.store.folder import read_request
+from hector_jax.store.folder import read_request, robot_file
 from hector_jax.tuning.loss import loss_of_robot
 
 
@@ -155,7 +155,8 @@ def run_export(args: flags.Export) -> None:
         out = folder / args.template.name.removesuffix(".j2")
         if out.resolve() == args.template.resolve():
             raise InputError(f"--template {out} would be overwritten; name it {out.name}.j2")
-        weights = arguments.weights_by_name(str(path), load_robot(args.robot))
+        robot = load_robot(args.robot or (robot_file(args.run) if is_run else None))
+        weights = arguments.weights_by_name(str(path), robot)
         write_file(out, fill_template(args.template, weights).encode())
         print_result(args.json, {"file": str(out)}, lambda: None)
         say(f"{out} has the weights {path}")
@@ -179,6 +180,7 @@ def run_export(args: flags.Export) -> None:
             folder,
             name=name,
             seconds=args.seconds,
+            prefix=args.prefix,
         )
     print_result(args.json, card, lambda: _print_check(card["check"] or {}))
     say(f"the export is in {folder}")

@@ -56,7 +56,7 @@ class MpcParameters(NamedTuple):
     max_force: Any  # [N] per foot
     effort_reference: Any  # share of the robot's weight in the force reference of R
     position_limit: Any  # [m] see `controller.limit_errors`
-    yaw_limit: Any  # [rad] as above
+    yaw_limit: Any  # [rad]
     integral: IntegralGains
     costs: Mapping[str, Any] = {}  # factors on the weights of the own costs, by name
 
@@ -73,8 +73,7 @@ class MpcConfig:
     step_ticks: Annotated[int, AT_LEAST_ONE] = 3  # ticks per step: dt = 0.03 s
     friction: Annotated[float, POSITIVE] = 0.6  # mu; larger than the floor's, the feet slip
     max_force: Annotated[float, POSITIVE] = 500.0  # [N] per foot
-    # share of a flat sole's half width that the plan uses
-    sole_width: Annotated[float, SHARE] = 1.0
+    sole_width: Annotated[float, SHARE] = 1.0  # share of a flat sole's half width in the plan
     # shares of the robot's inertia about the trunk's x, y and z with which the plan turns it
     inertia_share: tuple[float, ...] = (1.0, 1.0, 1.0)
     twist: Annotated[float, NOT_NEGATIVE] = 0.03  # [m] M_z per F_z, of the constraint "twist"
@@ -82,8 +81,7 @@ class MpcConfig:
     effort_reference: str = "zero"  # cost on u (paper); "gravity": on u minus the weight's share
     position_limit: float | None = None  # [m] largest horizontal error that counts; None: any
     yaw_limit: Annotated[float, POSITIVE] = 0.3  # [rad] largest heading error that counts
-    # [1/s^3] of `IntegralGains`, all four
-    horizontal_gain: Annotated[float, NOT_NEGATIVE] = 0.0
+    horizontal_gain: Annotated[float, NOT_NEGATIVE] = 0.0  # [1/s^3] of `IntegralGains`, as below
     height_gain: Annotated[float, NOT_NEGATIVE] = 0.0
     tilt_gain: Annotated[float, NOT_NEGATIVE] = 0.0
     yaw_gain: Annotated[float, NOT_NEGATIVE] = 0.0
@@ -107,12 +105,11 @@ class MpcConfig:
 
     def parameters(self, weights: Weights) -> MpcParameters:
         """Return the traced numbers."""
-        gains = (self.horizontal_gain, self.height_gain, self.tilt_gain, self.yaw_gain)
-        integral = IntegralGains(*gains, self.integral_limit)
+        names = ("horizontal_gain", "height_gain", "tilt_gain", "yaw_gain", "integral_limit")
+        integral = IntegralGains(*(getattr(self, name) for name in names))
         limit = math.inf if self.position_limit is None else self.position_limit
-        effort = float(self.effort_reference == "gravity")
         costs = {str(cost): 1.0 for cost in self.costs}
-        forces = (self.friction, self.max_force, effort)
+        forces = (self.friction, self.max_force, float(self.effort_reference == "gravity"))
         return MpcParameters(weights, *forces, limit, self.yaw_limit, integral, costs)
 
     def planned_inertia(self, inertia: Float[Any, "3 3"]) -> Float[Any, "3 3"]:

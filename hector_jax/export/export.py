@@ -35,7 +35,7 @@ from hector_jax.export.check import (
     compiler,
     record,
 )
-from hector_jax.export.source import controller_source
+from hector_jax.export.source import controller_source, with_prefix
 from hector_jax.robot.model import Robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import ideal
@@ -123,6 +123,14 @@ def _checked(
     return {"milliseconds": len(recorded.torque), **result._asdict()}
 
 
+def _times(check: dict[str, Any] | None) -> str:
+    """Return the longest calls of a check for the header."""
+    if check is None:
+        return "not measured"
+    plan, hold = (check[f"{kind}_ms"]["max"] for kind in ("plan", "hold"))
+    return f"a plan {plan:.2g} ms, a hold {hold:.2g} ms, on the computer that exported"
+
+
 def export(
     config: WalkConfig,
     robot: Robot,
@@ -132,6 +140,7 @@ def export(
     *,
     name: str,
     seconds: float = 1.0,
+    prefix: str = "controller",
 ) -> dict[str, Any]:
     """Write everything that goes to the robot, replacing existing files.
 
@@ -140,6 +149,7 @@ def export(
         command, seconds: command and length of the walk of the check, from t = 0 on.
         folder: folder to write.
         name: name of the weights, for the files.
+        prefix: of files and names of the C program, so that two can be in one program.
 
     Returns:
         The card, also in `controller.json`: sha256 of the files, weights, settings and the check,
@@ -150,18 +160,19 @@ def export(
         Broken: the compiled controller differs from the live one by more than TOLERANCE, or a QP
             of the check was not solved; nothing is written.
     """
-    make_folder(folder)
     weights_json = (as_json({"$schema": SCHEMA} | weights_tree(weights), indent=2) + "\n").encode()
-    source = controller_source(
-        config, robot, weights, name=name, content=weights_json, pieces=len(command.duration)
-    )
+    given = {"name": name, "content": weights_json, "pieces": len(command.duration)}
+    source = controller_source(config, robot, weights, **given)
+    with_prefix(source, prefix)  # refuses before the walk what it refuses
+    make_folder(folder)
     job = Job(weights, command, ideal(robot.description), seconds)
     recorded = record(config, robot, job)
     check = _checked(config, robot, source, recorded)
     # the card has the hashes of the other files: it is removed first and written last
     (folder / "controller.json").unlink(missing_ok=True)
     np.savez(archive := io.BytesIO(), **as_arrays(recorded))
-    contents = {file: text.encode() for file, text in source.items()}
+    source = controller_source(config, robot, weights, **given, measured=_times(check))
+    contents = {file: text.encode() for file, text in with_prefix(source, prefix).items()}
     contents["weights.json"] = weights_json
     contents[SCHEMA] = (as_json(weights_schema(robot), indent=2) + "\n").encode()
     if len(robot.foot_point) == 2:  # the C++ controller is for bipeds

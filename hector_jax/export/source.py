@@ -82,7 +82,7 @@ def controller_source(
     pieces: int = 0,
     measured: str = "not measured",
 ) -> dict[str, str]:
-    """Return `controller.c` and `controller.h` by their names.
+    """Return `controller.c`, `controller.h` and their `CMakeLists.txt` by their names.
 
     Args:
         config, robot, weights: the controller.
@@ -139,7 +139,7 @@ def controller_source(
     return render(id=hashlib.sha256(text.encode()).hexdigest()[:12], measured=measured)
 
 
-FILES = ("controller.h", "controller.c")
+FILES = ("controller.h", "controller.c", "CMakeLists.txt")
 _NAMES = "size exported lower upper init reset set_tunables set_max_changes drive from_imu".split()
 _NAMES += ["plan", "hold", "step"]
 
@@ -154,10 +154,11 @@ def with_prefix(source: dict[str, str], prefix: str) -> dict[str, str]:
         raise InputError(f"--prefix must be a name in C in small letters, got {prefix!r}")
     names = r"\bcontroller(?=_|\.[ch]\b)|(?<=struct )controller\b"
 
-    def rename(text: str) -> str:
+    def rename(text: str, names: str = names) -> str:
         return re.sub(r"\bCONTROLLER(?=_)", prefix.upper(), re.sub(names, prefix, text))
 
-    return {rename(file): rename(text) for file, text in source.items()}
+    cmake = {"CMakeLists.txt": "controller"}  # all there is a name
+    return {rename(f): rename(text, cmake.get(f, names)) for f, text in source.items()}
 
 
 def _c(value: Any) -> str:
