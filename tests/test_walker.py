@@ -27,6 +27,7 @@ from hector_jax.core.tree_file import named_leaves
 from hector_jax.own.program import program_of
 from hector_jax.own.walk_file import read_walk
 from hector_jax.own.walker import Walker, walker_engine
+from hector_jax.robot.model import load_robot
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
@@ -384,3 +385,13 @@ def test_a_file_of_numbers_is_filled_in_in_its_order_and_units(tmp_path, monkeyp
     assert call(monkeypatch, "export", "best", *line[2:], "--json") == 0  # that comes along
     assert json.loads(capsys.readouterr().out) == {"file": str(tmp_path / "gains.yaml")}
     assert float((tmp_path / "gains.yaml").read_text()[4:].split(",")[0]) > 0.0
+
+
+def test_a_template_takes_the_robot_of_its_run(tmp_path, monkeypatch):
+    file = ROOT / "examples" / "quadruped" / "robot.toml"
+    save_weights(tmp_path / "run" / "weights" / "best.json", nominal(load_robot(file)))
+    (tmp_path / "run" / "config.json").write_text(json.dumps({"flags": {"robot": str(file)}}))
+    (tmp_path / "gains.j2").write_text("{{ R.force | length }}")
+    line = ("export", tmp_path / "run", "--template", tmp_path / "gains.j2")
+    assert call(monkeypatch, *line, "--out", tmp_path) == 0
+    assert (tmp_path / "gains").read_text() == "4"
