@@ -1,0 +1,200 @@
+"""The C controller in programs of others: its calls, compilers, CMake, a robot that is held."""
+
+import ctypes
+import os
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import pytest
+from compiled import CONFIG, TUNED, WARNINGS, assert_same, needs_cc, source_of
+from model import OTHERS, ROBOT
+
+from hector_jax.control.contact import (
+    BOX_FRICTION,
+    FRICTION,
+    LINE_FRICTION,
+    TWIST,
+)
+from hector_jax.control.mpc import MpcConfig
+from hector_jax.control.reference import named_command
+from hector_jax.control.weights import expert, nominal
+from hector_jax.control.weights_file import best
+from hector_jax.core.environment import versions
+from hector_jax.core.inputs import InputError
+from hector_jax.core.tree_file import tree_hash
+from hector_jax.export import check
+from hector_jax.export.check import (
+    compare_with_live,
+    compile_controller,
+)
+from hector_jax.export.source import with_prefix
+from hector_jax.sim.loop import Job
+from hector_jax.sim.world import ideal
+
+pytestmark = pytest.mark.usefixtures("on_cpu")
+HERE = Path(__file__).parent
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    """The compiled controller of the tuned weights."""
+    needs_cc()
+    return compile_controller(source_of(TUNED), tmp_path_factory.mktemp("c"), *WARNINGS)
+
+
+@pytest.fixture(scope="module")
+def own_tests(library):
+    """The functions of exported_calls.c, compiled beside a controller, by their names."""
+    words = [*"cc -std=c99 -O2 -fPIC -shared -I. -o calls.so".split(), HERE / "exported_calls.c"]
+    subprocess.run([*words, "controller.c", "-lm"], cwd=library.parent, check=True)
+    return ctypes.CDLL(str(library.parent / "calls.so"))
+
+
+CALLS = re.findall(r"^int test_(\w+)\(", (HERE / "exported_calls.c").read_text(), re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_calls_of_the_controller(own_tests, name):
+    """Each returns the line of its first failure."""
+    assert getattr(own_tests, f"test_{name}")() == 0
+
+
+def test_two_exports_with_prefixes_are_used_by_one_file(tmp_path):
+    needs_cc()
+    both = {"left": TUNED, "right": CONFIG.with_others(nominal(), OTHERS)}
+    for prefix, weights in both.items():
+        for file, text in with_prefix(source_of(weights), prefix).items():
+            (tmp_path / file).write_text(text)
+    code = """#include "left.h"
+    #include "right.h"
+    static struct left a;
+    static struct right b;
+    int main(void) {
+        left_init(&a), right_init(&b);
+        return LEFT_FEET != RIGHT_FEET || a.next.Q[0] == b.next.Q[0];
+    }
+    """
+    (tmp_path / "main.c").write_text(code)
+    words = ["cc", "-std=c99", *WARNINGS, *"main.c left.c right.c -lm -o main".split()]
+    subprocess.run(words, cwd=tmp_path, check=True)
+    assert subprocess.run(["./main"], cwd=tmp_path).returncode == 0
+    assert "controller" not in (tmp_path / "CMakeLists.txt").read_text()
+    for wrong in ("", "1st", "a b", "Left", "a-b"):
+        with pytest.raises(InputError, match="--prefix must be a name in C"):
+            with_prefix({}, wrong)
+
+
+COMPILERS = {
+    "gcc": "-fanalyzer -Wdouble-promotion",
+    "clang": "-Wdouble-promotion",
+    "g++": "-x c++ -include cstdint -fsyntax-only",  # the header
+    "arm-none-eabi-gcc": "-mcpu=cortex-m7 -mthumb",
+    "aarch64-linux-gnu-gcc": "",
+}
+
+
+@pytest.mark.parametrize("name", COMPILERS)
+def test_compilers_have_nothing_to_say(library, name):
+    if shutil.which(name) is None:
+        pytest.skip(f"there is no {name}")
+    more = "-Wpedantic -Wshadow -Wvla -Wsign-conversion -Wcast-align -Wcast-qual".split()
+    file, standard = ("controller.h", []) if name == "g++" else ("controller.c", ["-std=c99"])
+    flags = ["-Wall", "-Wextra", "-Wconversion", "-Werror", *more, *COMPILERS[name].split()]
+    words = [name, *standard, "-O2", *flags, "-c", file, "-o", os.devnull]
+    subprocess.run(words, cwd=library.parent, check=True)
+
+
+def test_an_int_of_32_bits_may_be_a_long(library):
+    """As on 32-bit processors, whose compiler then refuses its address for that of an int."""
+    code = '#include <stdint.h>\n#define int32_t long\n#include "controller.c"\n'
+    words = "cc -std=c99 -Wall -Werror -fsyntax-only -x c -".split()
+    subprocess.run(words, cwd=library.parent, input=code, text=True, check=True)
+
+
+def test_the_header_says_the_size_the_stack_and_where_it_is_from(library):
+    header = (library.parent / "controller.h").read_text()
+    size = ctypes.c_size_t.in_dll(ctypes.CDLL(str(library)), "controller_size").value
+    assert abs(float(re.search(r"controller c; // (\d+) kB", header)[1]) - 1e-3 * size) <= 2.0
+    assert f"hector_jax {versions()['hector-jax']}, Apache-2.0" in header
+    assert tree_hash(ROBOT) in header
+    for line in re.search(r"struct controller_estimate \{(.*?)\};", header, re.DOTALL)[
+        1
+    ].splitlines():
+        assert not line or re.search(r"/\* .*\[\S+\].* \*/", line)
+
+
+CONSUMER = """cmake_minimum_required(VERSION 3.15)
+project(use LANGUAGES C)
+find_package(controller REQUIRED)
+file(WRITE use.c "#include <controller.h>
+static struct controller c;
+int main(void) { controller_init(&c); return c.next.Q[0] <= 0.0; }")
+add_executable(use use.c)
+target_link_libraries(use hector::controller)
+enable_testing()
+add_test(NAME use COMMAND use)
+"""
+
+
+def test_cmake_installs_it_for_another_project(library, tmp_path):
+    if shutil.which("cmake") is None:
+        pytest.skip("there is no CMake")
+    needs, place = tmp_path / "consumer", f"-DCMAKE_PREFIX_PATH={tmp_path}/there"
+    needs.mkdir()
+    (needs / "CMakeLists.txt").write_text(CONSUMER)
+    for words in (
+        ["-S", library.parent, "-B", "made"],
+        ["--build", "made"],
+        ["--install", "made", "--prefix", "there"],
+        ["-S", "consumer", "-B", "used", place],
+        ["--build", "used"],
+    ):
+        done = subprocess.run(["cmake", *words], cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+    assert subprocess.run([tmp_path / "used" / "use"]).returncode == 0
+
+
+def test_friction_in_a_box_and_twist_are_exported_too(tmp_path):
+    needs_cc()
+    of_line = tuple(
+        part for part in CONFIG.mpc.constraints if part not in (FRICTION, LINE_FRICTION)
+    )
+    config = replace(CONFIG, mpc=MpcConfig(constraints=(*of_line, BOX_FRICTION, TWIST)))
+    job = Job(expert(), named_command("c"), ideal(), 0.4)
+    recorded = check.record(config, ROBOT, job)
+    library = compile_controller(source_of(expert(), config), tmp_path)
+    assert_same(compare_with_live(config, ROBOT, library, recorded))
+
+
+@pytest.fixture(scope="module")
+def held(tmp_path_factory):
+    """exported_held.c with the shipped weights."""
+    needs_cc()
+    home, folder = Path(mujoco.__path__[0]), tmp_path_factory.mktemp("held")
+    libraries = list(home.glob("libmujoco.so*"))
+    if not libraries:
+        pytest.skip("this MuJoCo has no libmujoco.so")
+    for file, text in source_of(best()).items():
+        (folder / file).write_text(text)
+    words = ["cc", "-std=c99", "-O2", f"-I{home}/include", "-I.", HERE / "exported_held.c"]
+    words += ["controller.c", *libraries, f"-Wl,-rpath,{home}", "-lm", "-o", "held"]
+    subprocess.run(words, cwd=folder, check=True)
+    return folder / "held"
+
+
+HOLDS = [("stand", s, up) for s in (2, 5, 10, 30) for up in (0.02, 0.05, 0.15)]
+HOLDS += [("turn", s, 0.0) for s in (2, 4, 6, 8, 10)]
+QUICK = (("stand", 10, 0.02), ("turn", 6, 0.0))
+
+
+@pytest.mark.parametrize(
+    "hold", [pytest.param(h, marks=() if h in QUICK else pytest.mark.slow) for h in HOLDS]
+)
+def test_a_robot_that_a_hand_held_walks_on(held, hold):
+    words = [held, ROBOT.description.model, *map(str, hold)]
+    said = subprocess.run(words, capture_output=True, text=True)
+    assert (said.returncode, said.stderr) == (0, ""), said.stdout
