@@ -197,7 +197,6 @@ def test_the_header_has_our_numbers_and_says_what_the_cpp_controller_lacks():
 # The controller in C
 
 
-# with numbers of the plan and of the legs
 def save_run(folder):
     """A finished run, as far as export reads it."""
     save_weights(folder / "weights" / "best.json", TUNED)
