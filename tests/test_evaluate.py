@@ -1,6 +1,8 @@
 """Weight sets in several engines and models: the counts, what is claimed of them, the command."""
 
 import json
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -186,3 +188,18 @@ def test_a_named_set_is_not_a_folder_of_that_name(monkeypatch, tmp_path, capsys,
     assert call(monkeypatch, "evaluate", "--traj", "s", "--seeds", 1, "--weights", "nominal") == 0
     assert [float(job.weights.Q.euler[0]) for _, job in walked.jobs] == [nominal().Q.euler[0]]
     assert capsys.readouterr().out.startswith("s, 1 plant on the hardware stand-in\n")
+
+
+@pytest.mark.slow
+def test_two_evaluations_at_once_in_one_folder_walk_each_case_once(tmp_path):
+    line = "evaluate --traj straight --seeds 3 --seconds 0.1 --json --out both".split()
+    words = [sys.executable, "-m", "hector_jax", *line]
+    options = {"cwd": tmp_path, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    running = [subprocess.Popen(words, text=True, **options) for _ in range(2)]
+    one, other = (json.loads(program.communicate()[0]) for program in running)
+    assert one["columns"] == other["columns"]
+    rows = [json.loads(line) for line in (tmp_path / "both/walks.jsonl").read_text().splitlines()]
+    assert len({(row["set"], row["seed"]) for row in rows}) == len(rows) == 6
+    assert {(row["engine"], row["world"], row["model"]) for row in rows} == {
+        ("c", "standin", "own")
+    }

@@ -77,7 +77,7 @@ def run_evaluate(args: Evaluate) -> None:
     with nullcontext() if out is None else locked(out):
         with workers(args.processes, args.cluster) as pool:
             setup = Setup(pool, tunings.tune_config(plan.robot), plan.robot)
-            columns = _walk(setup, plan, out / "scores" if out else None)
+            columns = _walk(setup, plan, out)
         cells = cells_of(columns)
         result = report.matrix_report(cells, plan.differs, plan.world)
         if out is not None:
@@ -228,6 +228,7 @@ def _walk(setup: Setup, plan: EvaluationPlan, folder: Path | None) -> Columns:
             where=f" in {report.title_of(column)}" * (len(plan.columns) > 1),
             folder=folder,
             engine=plan.engines[column.engine],
+            about={"world": plan.world, "model": column.model},
         ).verdict
         for column in plan.columns
     }

@@ -169,8 +169,9 @@ def tune_walker(folder: Path, args: Tune) -> None:
         setup = Setup(pool, config, robot)
         options: dict[str, Any] = {
             "seconds": seconds,
-            "folder": folder / "scores",
+            "folder": folder,
             "engine": campaign.engine,
+            "about": {"world": "standin"},
         }
         for name, weights in compared.items():
             save_weights(folder / "weights" / f"{name}.json", weights)
