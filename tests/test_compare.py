@@ -10,7 +10,7 @@ from hector_jax.cli.parse import as_table
 from hector_jax.core.files import write_json
 from hector_jax.core.journal import write_rows
 from hector_jax.report.compare import compare_runs
-from hector_jax.store.folder import as_row, load_run
+from hector_jax.store.run import Run, as_row
 
 
 def verdict(L, falls=0, **changes):
@@ -73,7 +73,7 @@ def test_what_is_no_finished_run_is_told_by_its_file(runs, name, text, fault):
     if text is not None:
         (runs[0] / name).write_text(text)
     with pytest.raises(ValueError, match=fault) as told:
-        compare_runs([load_run(folder) for folder in runs])
+        compare_runs([Run(folder) for folder in runs])
     assert "\n" not in str(told.value)
 
 

@@ -15,7 +15,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.journal import add_row
 from hector_jax.sim.world import hfs, ideal
 from hector_jax.store import tunings
-from hector_jax.store.folder import as_row
+from hector_jax.store.run import as_row
 from hector_jax.store.setup import Setup
 from hector_jax.store.tunings import Problem
 from hector_jax.tuning.difftune import TuneConfig

@@ -15,7 +15,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, Wrench, no_samples
 from hector_jax.grfm.effect import last_command
 from hector_jax.report.report import render
-from hector_jax.store.folder import as_row
+from hector_jax.store.run import as_row
 from hector_jax.tuning.difftune import TuneConfig, tune
 from hector_jax.tuning.loss import (
     PAPER_LOSS,

@@ -39,7 +39,7 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
 from hector_jax.store import nets, tunings
-from hector_jax.store.folder import METRICS, RESULT, VERSIONS
+from hector_jax.store.run import METRICS, RESULT, VERSIONS
 from hector_jax.store.setup import Setup
 from hector_jax.tuning.curvature import Determined, determined
 from hector_jax.tuning.difftune import TuneConfig, Tuning

@@ -163,9 +163,10 @@ def score_jobs(
         new_jobs = [jobs[case] for case in missing]
         walks = walk_jobs(setup, new_jobs, title + remark, engine) if missing else ()
         for case, walk in zip(missing, walks, strict=True):
-            row = dict(zip(("trajectory", "set", "seed"), case, strict=True))
-            row |= {"engine": engine.name, **(about or {})}
-            row |= _as_row(_score_walk(setup, jobs[case], walk, engine)) | {"key": keys[case]}
+            trajectory, name, seed = case
+            row = {"trajectory": trajectory, "set": name, "seed": seed, "engine": engine.name}
+            row |= dict(about or {}) | {"key": keys[case]}
+            row |= _as_row(_score_walk(setup, jobs[case], walk, engine))
             if case in files:
                 stored[case] = at_interval(walk, setup.config.rollout.walk.gait.tick)
                 save_tree(files[case], stored[case], kind="walk", robot=setup.robot)
