@@ -108,8 +108,6 @@ def test_a_payload_that_arrives_is_felt_from_then_on_and_not_before():
     assert steps == pytest.approx(2.0 * 9.81, rel=0.01)
 
 
-# A slip that the legs feel lowers the plan's friction for a while
-
 SLIP, GAIT = SlipConfig(distance=0.05, share=0.4, recovery=0.6), GaitConfig()
 FEET = np.array([[0.0, 0.1, 0.0], [0.0, -0.1, 0.0]])
 
@@ -156,9 +154,6 @@ def test_a_floor_that_turns_slippery_is_walked_with_less_friction():
     # two programs, which may round otherwise
     forces = (each.command.force[:1000] for each in (felt, not_felt))
     np.testing.assert_allclose(*forces, rtol=1e-9, atol=1e-9)
-
-
-# Another model of the robot as the plant: the controller keeps its own numbers
 
 
 @pytest.fixture(scope="module")

@@ -65,9 +65,6 @@ def at(tick, measurement=None, memory=None, max_contacts=1):
     return planned(jnp.array(tick), memory, measurement, max_contacts=max_contacts)
 
 
-# What it measures
-
-
 @pytest.mark.parametrize("euler", [(0, 0, 0), (0.1, -0.2, 0.3), (-0.1, 0.1, 3.5), (0, 0.1, -9)])
 def test_measured_feet_are_those_of_mujoco_and_their_yaw_is_as_continuous_as_the_robots(euler):
     model = compile_model(describe())
@@ -90,9 +87,6 @@ def test_measured_feet_are_those_of_mujoco_and_their_yaw_is_as_continuous_as_the
         assert abs(feet.yaw[foot] - euler[2]) < 0.5
 
 
-# What it remembers
-
-
 def test_a_standing_foot_is_remembered_and_a_flying_one_is_not():
     old = init_memory(ROBOT, standing())
     now = standing(x=0.2)
@@ -104,9 +98,6 @@ def test_a_standing_foot_is_remembered_and_a_flying_one_is_not():
     later, _ = at(25, standing(x=0.4), memory)
     np.testing.assert_allclose(later.liftoff.position[0], feet.position[0])
     np.testing.assert_allclose(later.liftoff.position[1, 0] - memory.liftoff.position[1, 0], 0.4)
-
-
-# What it plans
 
 
 def test_every_number_that_the_plan_reads_has_a_derivative_and_compiles_nothing():
@@ -219,9 +210,6 @@ def test_room_for_two_feet_is_needed_before_the_gait_and_in_double_support():
     assert [contacts_needed(CONFIG, tick) for tick in (-110, -81, -80, 0, 400)] == [2, 2, 1, 1, 1]
     double = WalkConfig(gait=GaitConfig(stance=24, swing=16))
     assert contacts_needed(double, 0) == 2
-
-
-# What it asks of the joints
 
 
 def test_a_stance_leg_pushes_what_was_planned_and_a_swing_leg_is_pulled_on():

@@ -147,9 +147,6 @@ def test_the_weight_of_a_cost_of_ones_own_is_tuned_and_saved(tmp_path):
         replace(config, others=("cost_sped",))
 
 
-# What the walks determine
-
-
 def test_directions_are_said_with_the_weights_that_matter_in_them():
     vector, ridge = np.zeros(18), 0.05
     vector[[NAMES.index("Q_pitch"), NAMES.index("Q_x"), NAMES.index("R_Fz")]] = 0.9, -0.43, 0.05

@@ -84,8 +84,6 @@ def test_a_step_out_of_the_box_ends_exactly_on_its_wall(side, rule):
     np.testing.assert_array_equal(vector(stepped_once(huge, config, near)), vector(edge))
 
 
-# The loop, on a quadratic in log-weights whose optimum is known
-
 OPTIMUM = vector(nominal()) * np.exp(
     np.r_[np.linspace(-0.7, 0.9, 12), np.tile([0.3, -0.5, 0.8], 2), np.tile([0.2, 0.6, -0.4], 2)]
 )

@@ -43,8 +43,6 @@ README, RESULTS, LIMITS = ROOT / "README.md", DOCS / "results.md", DOCS / "limit
 PAGES = sorted(p for p in DOCS.rglob("*.md") if not {"_build", "reference"} & set(p.parts))
 READ = [README, ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md", *PAGES]
 
-# Examples and names
-
 
 def blocks(text, language=""):
     """Fenced blocks of a page."""
@@ -114,8 +112,6 @@ def test_commands_of_a_page_parse_and_what_it_names_is_there(path, capsys):
         tests = (ROOT / "tests" / f"{name}.py").read_text()
         assert f"def {test}" + ("" if more or not test else "(") in tests, (name, test)
 
-
-# Flags, sections, files and names, wherever they are told
 
 PACKAGE = ROOT / "hector_jax"
 FOREIGN = {"help", "help-all", "no-NAME", "tyro-print-completion"}
@@ -270,9 +266,6 @@ def test_pages_keep_their_budgets():
     assert readme.count("\n") <= 110
     assert len(prose.split()) <= 700
     assert not re.search(r"\bseeds?\b|\[-?\d+, -?\d+\]", readme)
-
-
-# Figures: each function yields a page and what it must say
 
 
 def report(name):
@@ -622,9 +615,6 @@ def test_each_number_of_readme_results_and_limits_is_that_of_its_file():
     for page in (RESULTS, LIMITS):
         rest = re.sub(r"\]\([^)]*\)|`[^`]*`|\b[GH][o0-9]2?\b", "", left[page])
         assert re.findall(r"\S*\d\S*", rest) == [], page.name  # numbers that no file is behind
-
-
-# The site, notebooks and the example
 
 
 @pytest.mark.slow

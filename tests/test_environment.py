@@ -28,8 +28,6 @@ def test_what_does_not_work_with_the_environment_is_one_line(wrong, words, told)
     assert said.startswith(f"hector: {told}")
 
 
-# Streams and signals
-
 TOY = """
 import sys
 from hector_jax.core.console import exit_code, say

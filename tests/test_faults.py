@@ -163,8 +163,6 @@ def test_a_start_that_cannot_be_believed_ends_the_run():
         tune(told(), robot=crouched)
 
 
-# Numbers that no rollout gives
-
 NUMBERS = [np.nan, np.inf, -np.inf, 1.7e308, -1.7e308, 1e-308, 5e-324, 0.0]
 
 

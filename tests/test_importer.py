@@ -95,8 +95,6 @@ def test_the_compiler_of_a_urdf_counts(tmp_path):
         assert words in propose_robot(path).error
 
 
-# What is refused, and what is told
-
 MOTORS = "<actuator>.*</actuator>"
 REFUSED = [  # what is told, and changes of the small biped
     ("'torso' push bodies", ('name="torso"', 'name="torso" gravcomp="1"')),
@@ -159,9 +157,6 @@ def test_what_is_likely_wrong_is_told(tmp_path, kind):
         assert re.search(r"left_ankle, right_ankle .* 30 / 20 ", "\n".join(table_of(robot)))
 
 
-# Legs as mirror images
-
-
 def test_a_hinge_is_a_line_and_has_no_sign(tmp_path):
     """Knee, ankle and hip of the right leg are moved along their own axes."""
     own = propose_robot(edited(tmp_path))
@@ -195,9 +190,6 @@ def test_knees_bend_from_the_straight_leg(tmp_path):
     assert proposal.survey.forwards == own.survey.forwards == (True,)
     assert proposal.table["standing"]["left_knee"] == pytest.approx(0.1, abs=1e-3)
     assert proposal.robot.standing_height == pytest.approx(own.robot.standing_height, abs=1e-3)
-
-
-# A proposal is never nothing
 
 
 def test_a_draft_has_what_was_found_and_what_is_to_be_mended(monkeypatch, capsys, tmp_path):

@@ -59,8 +59,6 @@ def one_line(error):
     return message
 
 
-# Settings
-
 CONFIGS = (GaitConfig, FootstepConfig, LegConfig, QpConfig, MpcConfig, WalkConfig, VideoConfig)
 CONFIGS += (RolloutConfig, TuneConfig, TrainConfig, CollectConfig, SceneConfig)
 SIGNED = {"LegConfig.landing", "FootstepConfig.feedback", "FootstepConfig.turn"}
@@ -103,9 +101,6 @@ def test_settings_are_refused_by_field_and_value():
         assert "must " in message
         parts = (value, *value) if isinstance(value, tuple) else (value,)
         assert any(short_repr(one) in message or repr(one)[:20] in message for one in parts)
-
-
-# One case a line: of each kind of fault one, for each loader
 
 
 def edited(part, entry, value):
@@ -159,9 +154,6 @@ def test_a_wrong_file_is_one_line_with_file_field_and_value(tmp_path, name, text
     message = one_line(caught.value)
     assert str(tmp_path / name) in message
     assert fault in message
-
-
-# Files
 
 
 @pytest.fixture(scope="module")

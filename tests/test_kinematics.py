@@ -209,9 +209,6 @@ def test_a_leg_and_its_derivatives_are_finite_on_axes_above_the_hip_and_out_of_r
         assert jnp.isfinite(found).all()
 
 
-# HECTOR's closed form
-
-
 HECTOR = load_robot()
 
 

@@ -70,9 +70,6 @@ START, _ = world_feet(base(), STANDS)
 END = START + jnp.array([[0.15, 0.02, 0.0], [0.1, -0.03, 0.0]])
 
 
-# Stance
-
-
 def test_stance_torques_and_ground_do_no_work_together_at_the_hip():
     state = base((0.1, -0.2, 0.7))
     rng = np.random.default_rng(0)
@@ -122,9 +119,6 @@ def test_stance_torques_and_leg_weight_are_the_statics_of_mujoco(robot, share):
     weight = jax.jit(leg_gravity)(robot, joints, jnp.asarray(robot.gravity))
     found = jax.jit(stance_torques)(robot, state, joints, wrench) + weight
     np.testing.assert_allclose(found, need, atol=1e-8)
-
-
-# Swing
 
 
 @pytest.mark.parametrize("step_up", [0.0, 0.05])
@@ -182,9 +176,6 @@ def test_a_swing_across_half_a_turn_takes_the_short_way():
     turned = START * jnp.array([-1.0, -1.0, 1.0])
     joints, _ = targets(state, turned, start_yaw, turned, end_yaw, jnp.full(2, SWING))
     np.testing.assert_allclose(np.asarray(joints)[::5], 0.1, atol=1e-9)
-
-
-# Torques
 
 
 def test_stance_legs_push_and_swing_legs_follow_and_carry_their_weight():

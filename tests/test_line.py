@@ -138,9 +138,6 @@ def test_a_path_with_an_equals_sign_is_a_file_where_there_is_one(monkeypatch, tm
     check_flags(from_line(["evaluate", "--weights", "nominal", "a=b/mine.json"]))
 
 
-# Names that are not text
-
-
 NAMES_OF_FILES = [
     (name, "" if field.default is MISSING else f"--{field.name}")
     for name, kind in COMMANDS.items()

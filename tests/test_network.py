@@ -140,9 +140,6 @@ def test_a_net_with_a_nan_is_refused_by_name(tmp_path, params):
         load_net(path, ROBOT)
 
 
-# The residual variant
-
-
 def test_a_mirrored_window_has_the_mirrored_effect(data, ensemble):
     told, count = predict(as_effect(ensemble), with_mirror(data).window), len(data.walk)
     here, there = (jax.tree.map(lambda x, k=k: x[k : k + count], told) for k in (0, count))

@@ -20,9 +20,6 @@ def body_pairs(model, data):
     return [tuple(model.body(b).name for b in pair) for pair in bodies]
 
 
-# What the file says
-
-
 def test_standing_trunk_is_at_548_millimetres_with_both_soles_on_the_floor():
     data = standing_data(Description(), MODEL)
     assert ROBOT.trunk_height == pytest.approx(0.548, abs=1e-3)
@@ -49,9 +46,6 @@ def test_robot_is_its_own_mirror_image():
     assert differences(ROBOT) == []
     np.testing.assert_allclose(ROBOT.com_offset[1], 0.0, atol=1e-15)
     np.testing.assert_allclose(ROBOT.inertia[[0, 1], [1, 2]], 0.0, atol=1e-15)
-
-
-# What touches what
 
 
 def test_robot_in_the_air_touches_only_leg_against_leg():

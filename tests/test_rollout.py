@@ -179,9 +179,6 @@ def test_a_walk_in_blocks_is_the_same_walk_with_the_same_gradient():
         np.testing.assert_allclose(a, b, rtol=1e-9)
 
 
-# Numbers of the controller beside Q and R
-
-
 @pytest.fixture(scope="module")
 def recursion():
     """The walk from there and its sensitivities."""

@@ -69,9 +69,6 @@ def test_what_is_beyond_the_limits_is_told_by_segment_value_and_range(rows, told
     assert re.search(told, said)
 
 
-# On the command line
-
-
 def test_a_walk_is_as_long_as_its_file_says_and_limits_are_told(monkeypatch, capsys, tmp_path):
     walks = []
 

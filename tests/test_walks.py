@@ -68,9 +68,6 @@ def same_sets(a, b):
     return len(a) == len(b) and all(map(same, a, b))
 
 
-# On the simulator
-
-
 @pytest.fixture(scope="module")
 def in_process(robot, tmp_path_factory):
     one = campaign(tmp_path_factory.mktemp("walked"), robot, [hfs()])
@@ -130,8 +127,6 @@ def test_the_reference_of_a_log_is_that_of_its_walk(robot):
     seen = walk_log.evaluate_log(CONFIG, robot, AHEAD, walk_log.log_of(walked))
     assert seen.loss == pytest.approx(float(loss_of(CONFIG.loss, walked)), rel=1e-9)
 
-
-# On a toy
 
 NOMINAL = np.asarray(weights_to_vector(nominal()))
 LOG = walk_log.log_of(no_samples(10, 2))  # one without samples: the toy needs none
@@ -323,9 +318,6 @@ def test_the_walks_count_where_the_code_would_now_step_elsewhere(toy):
     assert found.sets[1].losses[0] == pytest.approx(toy_loss(elsewhere, 0))
 
 
-# Falls
-
-
 def test_a_fall_is_a_bounded_loss_of_its_case_and_has_no_slope(toy):
     """Of e times the largest at the start; no loss counts as more."""
     one, at = toy(cases=3), nominal()
@@ -403,9 +395,6 @@ def test_from_a_start_that_falls_in_all_cases_nothing_is_tuned_and_in_one_it_is(
     found = walks.tune_on_walks(HERE, toy(cases=2, folder="one"), ask, 10)
     assert found.best == len(found.sets) - 1 > 0  # in no more cases than the start
     assert found.rows[found.best]["change"] < -90.0
-
-
-# Whose folder it is
 
 
 @pytest.mark.parametrize(
