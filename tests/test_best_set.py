@@ -5,11 +5,9 @@ import numpy as np
 import pytest
 from model import BEST_OTHERS, CONFIG, ROBOT
 
+from hector_jax import InputError, hfs, nominal
 from hector_jax.cli import arguments
 from hector_jax.control.parameters import GROUPS
-from hector_jax.control.weights import nominal
-from hector_jax.core.inputs import InputError
-from hector_jax.sim.world import hfs
 from hector_jax.tuning.loss import alphas
 from hector_jax.walk_tuning import best_set
 

@@ -10,16 +10,10 @@ import pytest
 from model import EXAMPLES
 from pretend import call
 
+from hector_jax import InputError, Job, expert, hfs, ideal, load_robot, named_command, nominal, walk
 from hector_jax.control.controller import WalkConfig, walk_config
-from hector_jax.control.reference import named_command
-from hector_jax.control.weights import expert, nominal
-from hector_jax.core.inputs import InputError
 from hector_jax.export.export import controller_of_run, find_weights
 from hector_jax.robot.description import Description
-from hector_jax.robot.model import load_robot
-from hector_jax.sim.loop import Job
-from hector_jax.sim.walk import walk
-from hector_jax.sim.world import hfs, ideal
 from hector_jax.store import folder as runs
 from hector_jax.store import nets
 from hector_jax.store.collection import load_walks

@@ -14,21 +14,14 @@ from oracles import mass_matrix
 from pretend import instead, pretend_walk
 from test_walk import walk_and_gain
 
-from hector_jax.control.controller import WalkConfig, walk_config
-from hector_jax.control.gait import GaitConfig
-from hector_jax.control.reference import named_command
+from hector_jax import InputError, Job, TuneConfig, expert, load_robot, walk
+from hector_jax.control import GaitConfig, WalkConfig, named_command, nominal, walk_config
 from hector_jax.control.slip import SlipConfig, feel, first_grip
-from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import best
-from hector_jax.core.inputs import InputError
-from hector_jax.robot.model import load_robot
-from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.parallel import walk_batch
-from hector_jax.sim.walk import walk
 from hector_jax.sim.world import build_world, hfs, ideal, standing_qpos
 from hector_jax.store.setup import Setup
-from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.verdict import judging
 
 CONFIG = WalkConfig()

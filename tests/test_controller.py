@@ -9,25 +9,18 @@ import numpy as np
 import pytest
 from model import HEIGHT, ROBOT, WEIGHT
 
+from hector_jax import State, WalkConfig, named_command
+from hector_jax.control import Anchor, GaitConfig, actuate, expert, init_memory, plan, step_plan
 from hector_jax.control.controller import (
-    WalkConfig,
-    actuate,
     contacts_needed,
-    init_memory,
     limit_distance,
     measured_feet,
-    plan,
     plan_horizon,
-    step_plan,
 )
-from hector_jax.control.gait import GaitConfig
 from hector_jax.control.legs import Measurement, stance_torques
 from hector_jax.control.mpc import Horizon, MpcConfig
 from hector_jax.control.parameters import TUNABLES, Q
-from hector_jax.control.reference import Anchor, named_command
-from hector_jax.control.weights import expert
 from hector_jax.core.geometry import rotation_from_euler
-from hector_jax.core.trajectory import State
 from hector_jax.qp import Status
 from hector_jax.robot.model import compile_model, describe
 

@@ -9,25 +9,15 @@ import numpy as np
 import pytest
 from model import ANCHOR, PLAIN, ROBOT, mean_of
 
+from hector_jax import InputError, RolloutConfig, Scenario, TuneConfig, named_command, rollout
 from hector_jax.control import MpcConfig, Squares, StateCost
 from hector_jax.control.parameters import gradient_by_steps, stepped
-from hector_jax.control.reference import named_command
 from hector_jax.control.weights import direction_names, expert
 from hector_jax.control.weights_file import load_weights, save_weights
-from hector_jax.core.inputs import InputError
 from hector_jax.tuning.curvature import determined, least_squares_jit
-from hector_jax.tuning.difftune import (
-    TuneConfig,
-    init,
-    model_slope,
-    trial_weights,
-    tune,
-    tune_step,
-    update,
-)
+from hector_jax.tuning.difftune import init, model_slope, trial_weights, tune, tune_step, update
 from hector_jax.tuning.evaluate import Objective, evaluate_jit
 from hector_jax.tuning.loss import PAPER_LOSS, losses, residuals, total
-from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 
 NAMES = direction_names()
 OTHERS = ("turn_lead", "footstep_feedback", "horizontal_gain", "yaw_gain")

@@ -9,15 +9,10 @@ import pytest
 from model import ROBOT
 from pretend import call, instead, pretend_walk
 
-from hector_jax.control.controller import WalkConfig
-from hector_jax.control.reference import named_command
-from hector_jax.control.weights import nominal
+from hector_jax import Job, WalkConfig, hfs, named_command, nominal, walk
 from hector_jax.control.weights_file import save_weights
 from hector_jax.sim import diagnosis
 from hector_jax.sim.diagnosis import Record, fall_of, likeliest_cause, not_the_weights
-from hector_jax.sim.loop import Job
-from hector_jax.sim.walk import walk
-from hector_jax.sim.world import hfs
 
 CONFIG = WalkConfig()
 JOB = Job(nominal(), named_command("straight"), hfs(), 1.0)

@@ -8,19 +8,14 @@ import numpy as np
 import pytest
 from model import ANCHOR, ROBOT, vector
 
-from hector_jax.control.controller import WalkConfig
-from hector_jax.control.footstep import FootstepConfig
-from hector_jax.control.mpc import MpcConfig
+from hector_jax import InputError, RolloutConfig, Scenario, Wrench, last_command
+from hector_jax.control import FootstepConfig, MpcConfig, WalkConfig
 from hector_jax.control.parameters import bounds
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import directions, expert, nominal, vector_to_weights
-from hector_jax.core.inputs import InputError
-from hector_jax.core.trajectory import Wrench
-from hector_jax.grfm.effect import last_command
 from hector_jax.tuning.difftune import TuneConfig, descend, init, trial_weights, tune, update
 from hector_jax.tuning.evaluate import Evaluation, Objective, aligned
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
-from hector_jax.tuning.rollout import RolloutConfig, Scenario
 from hector_jax.tuning.status import Stop
 
 

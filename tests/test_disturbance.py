@@ -6,15 +6,11 @@ import numpy as np
 import pytest
 from model import ANCHOR, ROBOT
 
+from hector_jax import PAPER_LOSS, RolloutConfig, Scenario, State, named_command, nominal, rollout
 from hector_jax.control.disturbance import NO_DISTURBANCE, IntegralGains, integrate_error
 from hector_jax.control.parameters import GROUPS, TUNABLES
-from hector_jax.control.reference import named_command
-from hector_jax.control.weights import nominal
-from hector_jax.core.trajectory import State
 from hector_jax.grfm.effect import Window, ground_effect
 from hector_jax.tuning.evaluate import evaluate_jit
-from hector_jax.tuning.loss import PAPER_LOSS
-from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 
 GAINS = {"horizontal_gain": 10.0, "height_gain": 40.0, "tilt_gain": 100.0, "yaw_gain": 50.0}
 INTEGRAL = IntegralGains(*GAINS.values())

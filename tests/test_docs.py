@@ -23,14 +23,12 @@ import pytest
 from delay import AS_PROPOSED, BEFORE
 from pretend import python
 
+from hector_jax import load_robot, nominal, walk_config
 from hector_jax.cli import flags, parse
-from hector_jax.control.controller import walk_config
 from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.reference import COMMANDS, named_command
-from hector_jax.control.weights import nominal
 from hector_jax.control.weights_file import best
 from hector_jax.core.tree_file import tree_hash
-from hector_jax.robot.model import load_robot
 from hector_jax.sim.margin import delay_lines
 from hector_jax.store.nets import CollectConfig
 from hector_jax.walk_tuning import best_set

@@ -10,12 +10,9 @@ import pytest
 from model import EXAMPLES
 from pretend import call
 
-from hector_jax.control.reference import standing_anchor
-from hector_jax.core.inputs import InputError
-from hector_jax.grfm.effect import last_command
+from hector_jax import InputError, RolloutConfig, Scenario, last_command, rollout, standing_anchor
 from hector_jax.report import pictures
 from hector_jax.sim.engine import ENGINES, MJX, MUJOCO_C, Engine, choose_engine
-from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 
 ARMS = EXAMPLES / "hector-v2" / "arms.toml"
 

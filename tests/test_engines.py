@@ -10,17 +10,12 @@ import pytest
 from model import ROOT
 from oracles import mass_matrix
 
-from hector_jax.control.controller import walk_config
-from hector_jax.control.reference import named_command
+from hector_jax import PAPER_LOSS, Job, load_robot, named_command, walk, walk_config
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.headless import mujoco
-from hector_jax.robot.model import load_robot
-from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant
-from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Push, build_world, hfs, ideal
-from hector_jax.tuning.loss import PAPER_LOSS
 from hector_jax.verdict.metrics import score
 
 HECTOR = load_robot()

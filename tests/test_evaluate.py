@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 from pretend import call, instead, pretend_score, pretend_walk
 
+from hector_jax import PAPER_LOSS, InputError, expert, nominal
 from hector_jax.cli import evaluate as command
-from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import save_weights
-from hector_jax.core.inputs import InputError
 from hector_jax.report import matrix as report
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.standin import even, standin
-from hector_jax.tuning.loss import PAPER_LOSS
 from hector_jax.verdict import judging, matrix
 from hector_jax.verdict.matrix import Column
 from hector_jax.verdict.metrics import make_verdict

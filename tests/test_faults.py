@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from model import ROBOT, small_effect
 
+from hector_jax import InputError, RolloutConfig, Scenario
 from hector_jax.control.parameters import bounds
 from hector_jax.control.reference import Command, standing_anchor
 from hector_jax.control.weights import nominal, weights_to_vector
-from hector_jax.core.inputs import InputError
 from hector_jax.tuning import difftune, rollout
 from hector_jax.tuning.difftune import TuneConfig, descend
 from hector_jax.tuning.evaluate import Evaluation, Objective
-from hector_jax.tuning.rollout import RolloutConfig, Scenario
 from hector_jax.tuning.status import Stop
 
 pytestmark = pytest.mark.usefixtures("on_cpu")

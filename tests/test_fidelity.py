@@ -8,13 +8,10 @@ import pytest
 from model import ANCHOR, ROBOT, SHORT
 from synthetic import synthetic_walk
 
-from hector_jax.control.reference import named_command
-from hector_jax.control.weights import nominal
+from hector_jax import Scenario, last_command, named_command, nominal, rollout
 from hector_jax.grfm.dataset import at_interval, make_dataset
-from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.training import errors_by_phi
 from hector_jax.report import fidelity
-from hector_jax.tuning.rollout import Scenario, rollout
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hector_jax.control import gait
-from hector_jax.control.gait import GaitConfig
+from hector_jax.control import GaitConfig, gait
 
 
 @pytest.mark.parametrize("config", [GaitConfig(), GaitConfig(stance=22, swing=18)])

@@ -6,18 +6,13 @@ import pytest
 from model import AHEAD, ANCHOR, BRIEF, PLAIN, ROBOT
 from pretend import elsewhere, no_belief
 
-from hector_jax.control.reference import named_command
+from hector_jax import PAPER_LOSS, Job, Scenario, hfs, named_command, walk
 from hector_jax.control.weights import nominal, vector_to_weights, weights_to_vector
 from hector_jax.control.weights_file import best
 from hector_jax.core.trajectory import State, Wrench, no_samples
-from hector_jax.sim.loop import Job
-from hector_jax.sim.walk import walk
-from hector_jax.sim.world import hfs
 from hector_jax.tuning.curvature import least_squares_jit
 from hector_jax.tuning.evaluate import evaluate_jit
 from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
-from hector_jax.tuning.loss import PAPER_LOSS
-from hector_jax.tuning.rollout import Scenario
 from hector_jax.walk_tuning.best_set import drawn_plants
 
 SCENARIO = Scenario(ROBOT, AHEAD, ANCHOR, PLAIN)

@@ -11,22 +11,15 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 from test_rollout import OBLIQUE, check_gradient
 
+from hector_jax import Job, RolloutConfig, Scenario, hfs, ideal, last_command, load_robot, walk
+from hector_jax.control import named_command, nominal, standing_anchor, walk_config
 from hector_jax.control.contact import CORNER_FRICTION, FLAT_FOOT, Contact, rows
-from hector_jax.control.controller import walk_config
-from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.weights import nominal
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.export.check import compare_with_live, compile_controller, compiler, record
 from hector_jax.export.source import controller_source
 from hector_jax.grfm.dataset import at_interval
-from hector_jax.grfm.effect import last_command
 from hector_jax.importing.remarks import differences
-from hector_jax.robot.model import load_robot
-from hector_jax.sim.loop import Job
 from hector_jax.sim.parallel import walk_batch
-from hector_jax.sim.walk import walk
-from hector_jax.sim.world import hfs, ideal
-from hector_jax.tuning.rollout import RolloutConfig, Scenario
 
 ROBOT = load_robot(EXAMPLES / "humanoid" / "robot.toml")
 CONFIG = walk_config(ROBOT)

@@ -11,8 +11,7 @@ from model import EXAMPLES
 from pretend import call
 from published import JOINTS, replaced, small
 
-from hector_jax.control.controller import walk_config
-from hector_jax.core.inputs import InputError
+from hector_jax import InputError, walk_config
 from hector_jax.core.settings import as_toml
 from hector_jax.importing.propose import HEIGHT, MASS, propose_robot
 from hector_jax.importing.remarks import remarks

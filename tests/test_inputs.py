@@ -16,26 +16,19 @@ from hypothesis import strategies as st
 from model import ROBOT
 from scenes import SceneConfig
 
+from hector_jax import QpConfig, RolloutConfig, TuneConfig, expert
 from hector_jax.cli.flags import Evaluate, Tune
 from hector_jax.cli.parse import from_file
-from hector_jax.control.controller import WalkConfig
-from hector_jax.control.footstep import FootstepConfig
-from hector_jax.control.gait import GaitConfig
-from hector_jax.control.legs import LegConfig
-from hector_jax.control.mpc import MpcConfig
+from hector_jax.control import FootstepConfig, GaitConfig, LegConfig, MpcConfig, WalkConfig
 from hector_jax.control.trajectories import load_command
-from hector_jax.control.weights import expert
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.tree_file import save_tree
 from hector_jax.grfm import network
 from hector_jax.grfm.training import TrainConfig
-from hector_jax.qp import QpConfig
 from hector_jax.report.video import VideoConfig
 from hector_jax.store import collection
 from hector_jax.store.nets import CollectConfig
-from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.rollout import RolloutConfig
 
 QUIET = {"database": None, "deadline": None, "suppress_health_check": list(HealthCheck)}
 hundreds = settings(max_examples=300, derandomize=True, **QUIET)

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from model import QUADRUPED, ROBOT, WEIGHT
 
+from hector_jax.control import LegConfig, Measurement
 from hector_jax.control.footstep import Feet
 from hector_jax.control.legs import (
-    LegConfig,
-    Measurement,
     joint_torques,
     stance_torques,
     swing_joints,

@@ -9,17 +9,12 @@ import pytest
 from model import ANCHOR, ROBOT
 from pretend import pretend_walk
 
-from hector_jax.control.reference import named_command
-from hector_jax.control.weights import nominal
-from hector_jax.core.inputs import InputError
+from hector_jax import PAPER_LOSS, InputError, LossTerm, last_command, named_command, nominal
 from hector_jax.core.trajectory import State, Wrench, no_samples
-from hector_jax.grfm.effect import last_command
 from hector_jax.report.report import render
 from hector_jax.store.folder import as_row
 from hector_jax.tuning.difftune import TuneConfig, tune
 from hector_jax.tuning.loss import (
-    PAPER_LOSS,
-    LossTerm,
     changes_between,
     loss_of_robot,
     losses,

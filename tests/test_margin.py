@@ -8,9 +8,7 @@ from model import QUADRUPED, ROBOT
 from oracles import mass_matrix
 from scipy.linalg import solve_discrete_are
 
-from hector_jax.control.controller import walk_config
-from hector_jax.control.mpc import MpcConfig
-from hector_jax.control.weights import nominal
+from hector_jax.control import MpcConfig, nominal, walk_config
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.checks import standing_data
 from hector_jax.robot.model import compile_model

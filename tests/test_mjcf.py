@@ -11,8 +11,7 @@ from model import EXAMPLES
 from pretend import call
 from published import HOLD, JOINTS, LINK, MOTOR, by_numbers, replaced, small, urdf_of
 
-from hector_jax.control.controller import walk_config
-from hector_jax.core.inputs import InputError
+from hector_jax import InputError, walk_config
 from hector_jax.robot.description import MODEL_PATH, Foot
 from hector_jax.robot.model import compile_model, describe, load_robot, robot_of
 

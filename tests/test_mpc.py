@@ -12,19 +12,8 @@ import scipy.linalg
 from model import ROBOT, WEIGHT, random_weights
 from oracles import exact_solution, pack_state
 
-from hector_jax.control.contact import (
-    FLAT_FOOT,
-    FRICTION,
-    LINE_FOOT,
-    LINE_FRICTION,
-    Contact,
-    InputConstraint,
-    InputCost,
-    Rows,
-    Squares,
-    StateConstraint,
-    StateCost,
-)
+from hector_jax.control import LINE_FOOT, InputConstraint, InputCost, Squares, StateConstraint
+from hector_jax.control.contact import FLAT_FOOT, FRICTION, LINE_FRICTION, Contact, Rows, StateCost
 from hector_jax.control.disturbance import NO_DISTURBANCE
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, build_qp, solve_mpc
 from hector_jax.control.parameters import bounds

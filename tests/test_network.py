@@ -9,10 +9,8 @@ import pytest
 from model import LEARNS_TOUCHDOWNS, ROBOT
 from synthetic import synthetic_walk
 
-from hector_jax.control.controller import WalkConfig
+from hector_jax import TuneConfig, WalkConfig, Wrench, named_command
 from hector_jax.control.gait import GaitConfig
-from hector_jax.control.reference import named_command
-from hector_jax.core.trajectory import Wrench
 from hector_jax.core.tree import stack
 from hector_jax.grfm import paper, residual
 from hector_jax.grfm.dataset import ACROSS, ALONG, at_interval, make_dataset, with_mirror
@@ -23,7 +21,6 @@ from hector_jax.grfm.paper import fit_linear, fit_scaling
 from hector_jax.grfm.residual import BOUND, plain_net
 from hector_jax.grfm.training import predict
 from hector_jax.store.tunings import Problem, rollouts_of
-from hector_jax.tuning.difftune import TuneConfig
 
 apply = jax.jit(lambda effect, window: effect(window))
 

@@ -7,17 +7,12 @@ import numpy as np
 import pytest
 from model import OTHERS, ROBOT
 
-from hector_jax.control.controller import WalkConfig
-from hector_jax.control.reference import named_command
-from hector_jax.control.weights import expert, nominal
+from hector_jax import Job, WalkConfig, expert, load_robot, named_command, nominal, walk
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.robot.description import MODEL_PATH
-from hector_jax.robot.model import load_robot
-from hector_jax.sim.loop import Job
 from hector_jax.sim.mjx_model import batched_model, mjx
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.standin import standin
-from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Push, build_world, build_worlds, hfs, hfs_drawn, ideal
 
 CONFIG = WalkConfig()

@@ -12,12 +12,10 @@ from model import ROBOT
 from pretend import HandsOver, call
 from synthetic import synthetic_walk
 
+from hector_jax import InputError, TuneConfig, named_command
 from hector_jax.cli import tune
-from hector_jax.control import mpc
-from hector_jax.control.reference import named_command
-from hector_jax.control.weights import nominal
+from hector_jax.control import mpc, nominal
 from hector_jax.control.weights_file import save_weights
-from hector_jax.core.inputs import InputError
 from hector_jax.grfm import dataset
 from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.grfm.training import TrainConfig
@@ -25,7 +23,6 @@ from hector_jax.store import nets, tunings
 from hector_jax.store.collection import collect
 from hector_jax.store.nets import CollectConfig
 from hector_jax.store.setup import Setup
-from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
 
 ONCE = TrainConfig("linear")  # the command's variant here: its fit takes no time

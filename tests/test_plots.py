@@ -5,10 +5,9 @@ import pytest
 from matplotlib.colors import to_rgb
 from pretend import elsewhere, pretend_history, pretend_walk
 
-from hector_jax.core.trajectory import State
+from hector_jax import PAPER_LOSS, State
 from hector_jax.report import plots
 from hector_jax.report.plots.style import SETS, looks_of
-from hector_jax.tuning.loss import PAPER_LOSS
 
 FOUR = ("nominal", "expert", "without", "with")
 

@@ -19,14 +19,12 @@ from oracles import (
 )
 
 from benchmarks.problems import draw_problems, layer_qp
-from hector_jax.control.controller import WalkConfig
+from hector_jax import WalkConfig, load_robot
 from hector_jax.core.settings import from_table, to_table
 from hector_jax.core.tree import stack
-from hector_jax.qp import QP, QpConfig, Solver, Status, check_solved, gpu_kernel, solve_qp
+from hector_jax.qp import JAXOPT, QP, QpConfig, Solver, Status, check_solved, gpu_kernel, solve_qp
 from hector_jax.qp.active_set import first_guess
 from hector_jax.qp.interior_point import approach
-from hector_jax.qp.method import JAXOPT
-from hector_jax.robot.model import load_robot
 
 WALKING = 500
 SHAPES = [(1, 4), (2, 6), (5, 12), (12, 30), (30, 40), (50, 70), (120, 100)]

@@ -12,26 +12,19 @@ import pytest
 from model import EXAMPLES
 from pretend import call
 
+from hector_jax import InputError, Job, State, Wrench, hfs, ideal, last_command, load_robot, walk
 from hector_jax.cli.arguments import with_gait
-from hector_jax.control import gait
+from hector_jax.control import gait, named_command, standing_anchor
 from hector_jax.control.controller import plan_horizon, walk_config
 from hector_jax.control.footstep import Feet
 from hector_jax.control.gait import GaitConfig, gait_named
-from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import direction_names, expert, nominal, weight_names
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
-from hector_jax.core.inputs import InputError
-from hector_jax.core.trajectory import State, Wrench
 from hector_jax.export.export import weights_schema
 from hector_jax.grfm.dataset import ACROSS, ALONG, make_dataset, partners, with_mirror
-from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.gated import fit_gated
 from hector_jax.grfm.network import as_effect, load_net, save_net
 from hector_jax.grfm.residual import init, with_statistics
-from hector_jax.robot.model import load_robot
-from hector_jax.sim.loop import Job
-from hector_jax.sim.walk import walk
-from hector_jax.sim.world import hfs, ideal
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 
 FILE = EXAMPLES / "quadruped" / "robot.toml"

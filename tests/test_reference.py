@@ -3,16 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hector_jax.control.reference import (
-    COMMANDS,
-    PIECES,
-    UNSEEN,
-    Anchor,
-    Command,
-    named_command,
-    reference_at,
-    with_pieces,
-)
+from hector_jax.control import named_command, reference_at
+from hector_jax.control.reference import COMMANDS, PIECES, UNSEEN, Anchor, Command, with_pieces
 
 ANCHOR = Anchor(jnp.array([0.3, -0.2, 0.42]), jnp.array(0.7), jnp.array(10))
 

@@ -9,13 +9,8 @@ import pytest
 import race
 from rivals import RIVALS, Task, search
 
-from hector_jax.control.reference import named_command
-from hector_jax.control.weights import nominal
-from hector_jax.core.inputs import InputError
-from hector_jax.robot.model import load_robot
+from hector_jax import InputError, TuneConfig, hfs, load_robot, named_command, nominal
 from hector_jax.sim.engine import MUJOCO_C
-from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.walk_tuning.campaign import Campaign
 
 BOX = np.array([[-3.0, 1.0]] * 6)

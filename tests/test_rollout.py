@@ -21,18 +21,17 @@ from model import (
     vector,
 )
 
+from hector_jax import RolloutConfig, Scenario, last_command, rollout
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.tree import stack
 from hector_jax.grfm.dataset import make_dataset
-from hector_jax.grfm.effect import last_command
 from hector_jax.tuning.curvature import least_squares_jit
 from hector_jax.tuning.difftune import TuneConfig, init, step_status, tune_step
 from hector_jax.tuning.evaluate import evaluate, evaluate_jit, gradient_norms
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total, with_alphas
 from hector_jax.tuning.parallel_rollout import parallel_rollout
-from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.tuning.status import StepStatus
 from hector_jax.tuning.variation import drawn_variation
 

@@ -7,25 +7,12 @@ import pytest
 from model import EXAMPLES, ROBOT
 from pretend import call, instead
 
+from hector_jax import InputError, Job, TuneConfig, hfs, named_command, walk
 from hector_jax.cli import arguments
-from hector_jax.control.controller import WalkConfig
-from hector_jax.control.gait import GaitConfig
-from hector_jax.control.reference import (
-    COMMANDS,
-    UNSEEN,
-    Command,
-    named_command,
-    reference_at,
-    standing_anchor,
-)
+from hector_jax.control import GaitConfig, WalkConfig, expert, nominal
+from hector_jax.control.reference import COMMANDS, UNSEEN, Command, reference_at, standing_anchor
 from hector_jax.control.trajectories import beyond, command_of, limits
-from hector_jax.control.weights import expert, nominal
-from hector_jax.core.inputs import InputError
 from hector_jax.sim import walk as sim_walk
-from hector_jax.sim.loop import Job
-from hector_jax.sim.walk import walk
-from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import TuneConfig
 
 SLALOM = EXAMPLES / "slalom.toml"
 LIMITS = limits(ROBOT, GaitConfig())

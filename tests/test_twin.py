@@ -11,16 +11,12 @@ import pytest
 from model import AHEAD, ANCHOR, EXAMPLES, HEIGHT, PLAIN, ROBOT
 from pretend import call
 
+from hector_jax import InputError, State, expert, load_robot, named_command
 from hector_jax.control.contact import BOX_FRICTION, TWIST, Constraint
 from hector_jax.control.controller import WalkConfig, plan, plan_horizon, walk_config
 from hector_jax.control.footstep import Feet
 from hector_jax.control.mpc import MpcConfig
-from hector_jax.control.reference import named_command
 from hector_jax.control.twin import FROM_ROBOT, FROZEN, PATH, ReferenceInputs, TwinConfig
-from hector_jax.control.weights import expert
-from hector_jax.core.inputs import InputError
-from hector_jax.core.trajectory import State
-from hector_jax.robot.model import load_robot
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout, rollout_config
 
 OWN = EXAMPLES / "own_controller"

@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 from model import ANCHOR, ROBOT, robot_with
 
-from hector_jax.control.reference import named_command
-from hector_jax.control.weights import nominal
-from hector_jax.core.inputs import InputError
-from hector_jax.core.trajectory import State, Wrench
+from hector_jax import InputError, State, Wrench, named_command, nominal
 from hector_jax.grfm.effect import ground_effect, last_command
 from hector_jax.robot import srbm
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total

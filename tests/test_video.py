@@ -11,8 +11,7 @@ from PIL import Image
 from pretend import instead, pretend_walk
 from scipy.spatial.transform import Rotation
 
-from hector_jax.core.inputs import InputError
-from hector_jax.core.trajectory import State
+from hector_jax import InputError, State
 from hector_jax.report import video
 from hector_jax.report.motion import motion, motions, poses
 from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film, write_strip

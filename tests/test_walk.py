@@ -11,13 +11,10 @@ from model import OTHERS, ROBOT
 from pretend import USUAL, python
 from test_sensing import momentum
 
-from hector_jax.control.controller import WalkConfig
+from hector_jax import Job, WalkConfig, expert, walk
 from hector_jax.control.reference import COMMANDS, named_command
-from hector_jax.control.weights import expert
-from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.standin import standin
-from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Push, build_world, hfs, ideal
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 

@@ -16,25 +16,13 @@ import pytest
 from model import AHEAD, BRIEF, vector
 from pretend import HandsOver, files
 
-from hector_jax.control.reference import named_command
-from hector_jax.control.weights import (
-    directions,
-    expert,
-    nominal,
-    vector_to_weights,
-    weights_to_vector,
-)
+from hector_jax import InputError, Job, TuneConfig, hfs, load_robot, named_command, nominal, walk
+from hector_jax.control.weights import directions, expert, vector_to_weights, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights
-from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import save_tree
 from hector_jax.own import walk_log
-from hector_jax.robot.model import load_robot
 from hector_jax.sim.engine import MUJOCO_C
-from hector_jax.sim.loop import Job
-from hector_jax.sim.walk import walk
-from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import loss_of
 from hector_jax.walk_tuning import added_logs, walks

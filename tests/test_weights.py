@@ -5,16 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hector_jax.control.controller import WalkConfig
-from hector_jax.control.mpc import MpcConfig
+from hector_jax.control import MpcConfig, WalkConfig, Weights, expert, nominal
 from hector_jax.control.parameters import TUNABLES, bounds
 from hector_jax.control.weights import (
-    Weights,
     between,
     direction_names,
     directions,
-    expert,
-    nominal,
     scale_weights,
     vector_to_weights,
     weight_names,

@@ -10,6 +10,7 @@ import pytest
 from model import ROBOT
 from test_sensing import stand
 
+from hector_jax import hfs, ideal
 from hector_jax.robot.model import quiet_mujoco
 from hector_jax.sim.actuators import init_actuators, step_actuators
 from hector_jax.sim.world import (
@@ -17,12 +18,10 @@ from hector_jax.sim.world import (
     NO_PUSH,
     Push,
     build_world,
-    hfs,
     hfs_drawn,
     hfs_even,
     hfs_varied,
     hfs_with_motors,
-    ideal,
     noisy,
     push_force,
     standing_qpos,
