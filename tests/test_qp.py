@@ -80,13 +80,9 @@ def walked(walking):
     return stack([still(qp) for qp in walking])
 
 
-@pytest.fixture(scope="module")
-def exact(walking):
-    return np.stack([exact_solution(qp)[0] for qp in walking])
-
-
-def test_walking_qps_are_solved_to_the_first_newton(walked, exact):
+def test_walking_qps_are_solved_to_the_first_newton(walking, walked):
     check_solved(walked)
+    exact = np.stack([exact_solution(qp)[0] for qp in walking])
     error = np.abs(walked.x - exact)[:, :5].max(axis=1)
     assert np.median(error) <= 1e-8
     assert error.max() <= 1e-4
@@ -257,8 +253,7 @@ def test_a_verdict_changes_at_its_threshold_and_the_derivative_with_it(name):
     for told, values in sides.items():
         status = Status[told]
         for value in values:
-            qp = make(value)
-            alone = solve(qp)
+            alone = solve(qp := make(value))
             found, moved = along(qp, jax.tree.map(jnp.ones_like, qp))
             assert Status(int(alone.status)) == status, value
             assert found.status == alone.status
@@ -320,12 +315,9 @@ def test_curvature_is_judged_in_units_of_the_variables():
             np.testing.assert_allclose(found_x / D, x, atol=1e-10 * np.abs(x).max())
 
 
-def test_a_row_of_small_numbers_binds():
+def test_rows_of_small_numbers_bind_bounds_move_and_crossed_ones_are_an_equality_in_the_middle():
     pressed = solve(rows((1e-9 * np.array(FIRST), -INF, -1e-9), (BOTH, -INF, 9.0)))
     np.testing.assert_allclose(pressed.x, [-1.0, 5.0], atol=1e-9)
-
-
-def test_bounds_move_the_solution_and_crossed_ones_are_an_equality_with_their_middle():
     for lower, upper, at, moves in ((-INF, 0.5, 0.5, 1.0), (1.0 + 1e-9, 1.0 - 1e-9, 1.0, 0.5)):
         qp = rows((FIRST, lower, upper))
         found, moved = along(qp, only(qp, u=np.ones(3)))
@@ -369,24 +361,16 @@ def of_kind(seed):
 
 def with_rows(qp, rows, lower, upper):
     """Three more rows, so that all have one shape."""
-    return qp._replace(
-        A=np.concatenate([qp.A, np.broadcast_to(rows, (3, 5))]),
-        l=np.concatenate([qp.l, lower]),
-        u=np.concatenate([qp.u, upper]),
-    )
+    A = np.concatenate([qp.A, np.broadcast_to(rows, (3, 5))])
+    return qp._replace(A=A, l=np.r_[qp.l, lower], u=np.r_[qp.u, upper])
 
 
 def in_units(qp, objective=1.0, row=1.0, variable=1.0):
     """The same problem with objective, rows and variables in other units; new rows keep theirs."""
     row = np.r_[np.broadcast_to(row, 9), np.ones(3)]
     variable = np.broadcast_to(variable, 5)
-    return QP(
-        objective * qp.P * np.outer(variable, variable),
-        objective * qp.q * variable,
-        row[:, None] * qp.A * variable,
-        row * qp.l,
-        row * qp.u,
-    )
+    P, q = objective * qp.P * np.outer(variable, variable), objective * qp.q * variable
+    return QP(P, q, row[:, None] * qp.A * variable, row * qp.l, row * qp.u)
 
 
 def test_units_redundant_rows_and_rounding_change_no_verdict():
@@ -718,23 +702,18 @@ def test_a_program_with_strict_promotion_can_solve_and_differentiate(kind):
     low, high = np.array([1.0, 0.0], kind), np.array([1.0, 0.2], kind)
     blocks = QP(np.eye(2, dtype=kind), -one, np.eye(2, dtype=kind)[:, None, :1], -one, one)
     with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
-        for qp in (
-            QP(np.eye(2, dtype=kind), 0 * one, A, low, high),
-            blocks._replace(A=A[:1, None]),
-        ):
+        dense = QP(np.eye(2, dtype=kind), 0 * one, A, low, high)
+        for qp in (dense, blocks._replace(A=A[:1, None], l=-one[:1], u=one[:1])):
             qp = jax.tree.map(jnp.asarray, qp)
-            if qp.A.ndim == 3:
-                qp = qp._replace(l=qp.l[:1], u=qp.u[:1])
             slope = jax.jit(jax.grad(jax.jit(lambda q, qp=qp: solve_qp(qp._replace(q=q)).x[0])))
             assert np.isfinite(slope(qp.q)).all()
-            found = solve_qp(qp).x
-            assert found.dtype == kind
+            assert solve_qp(qp).x.dtype == kind
     found = solve_qp(QP(np.eye(2), 0.0 * one, A, low, high)).x
     np.testing.assert_allclose(found, [0.2, 0.8], atol=1e-6)
 
 
 def test_whole_numbers_are_solved_in_the_default_floats():
-    qp = QP(*(jnp.asarray(x) for x in ([[2, 0], [0, 2]], [-2, -5], [[1, 2]], [-10], [3])))
-    found = solve_qp(qp)
+    parts = [[2, 0], [0, 2]], [-2, -5], [[1, 2]], [-10], [3]
+    found = solve_qp(QP(*map(jnp.asarray, parts)))
     assert found.x.dtype == np.float64
     np.testing.assert_allclose(found.x, [0.4, 1.3], atol=1e-12)
