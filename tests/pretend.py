@@ -209,8 +209,3 @@ def tuning_of(history, weights=None, stop=Stop.LIMIT):
     weights = last.weights if weights is None else weights
     precision = np.outer(direction, direction) + 0.01 * np.eye(len(direction))
     return Tuning(weights, last.evaluation.loss, precision, np.array(stop), stack(history))
-
-
-def pretend_tuning(iterations=30, weights=None, **history):
-    """The tuning of `pretend_history`, which leads to given weights, by default nominal."""
-    return tuning_of(pretend_history(iterations, **history), weights)

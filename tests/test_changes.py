@@ -115,16 +115,13 @@ def course(moves, start=0):
     return np.array(shares)
 
 
-def test_a_foot_that_moves_far_in_its_stance_has_slipped():
+def test_a_foot_that_moves_far_in_its_stance_has_slipped_and_the_friction_grows_back_in_time():
     assert np.all(course([0.0] * 4 + [0.024] * 6) == 1.0)  # [m] 0.05 of the height are 0.025
     np.testing.assert_allclose(course([0.0] * 4 + [0.03] * 6), [1.0] * 4 + [0.88] * 6)
     np.testing.assert_allclose(course([0.0] * 4 + [0.2] * 6), [1.0] * 4 + [0.4] * 6)
     assert np.all(course([0.1, 0.1, 0.1, 0.1]) == 1.0)  # the first ticks of the stance
     assert np.all(course(np.linspace(0.0, 0.4, 20), start=GAIT.stance) == 1.0)  # it swings
     assert np.all(course([0.1] * 8, start=GAIT.first_tick - 8) == 1.0)  # it stands before the gait
-
-
-def test_the_friction_grows_back_within_the_time_of_recovery():
     shares = course([0.0] * 4 + [0.05] + [0.0] * 75)
     assert shares[4] == 0.4
     np.testing.assert_allclose(np.diff(shares[4:64]), 0.6 * GAIT.tick / 0.6)

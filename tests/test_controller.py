@@ -205,7 +205,7 @@ def test_room_for_two_feet_is_needed_before_the_gait_and_in_double_support():
     assert contacts_needed(double, 0) == 2
 
 
-def test_a_stance_leg_pushes_what_was_planned_and_a_swing_leg_is_pulled_on():
+def test_a_stance_leg_pushes_as_planned_a_swing_leg_is_pulled_on_and_ticks_join():
     measurement = standing()
     memory, decided = at(22, measurement)
     now, later = (commanded(decided, memory, jnp.array(ms), measurement) for ms in (0, 9))
@@ -213,10 +213,6 @@ def test_a_stance_leg_pushes_what_was_planned_and_a_swing_leg_is_pulled_on():
     np.testing.assert_allclose([now[5:], later[5:]], [expected[5:]] * 2, atol=1e-9)
     assert now[8] > 5.0  # the knee holds the weight
     assert later[3] < now[3] - 0.5  # and that of the other leg bends more and more
-
-
-def test_the_last_millisecond_of_a_tick_is_the_first_of_the_next():
-    measurement = standing()
     memory, decided = at(25, measurement)
     next_tick = decided._replace(swing_ticks=decided.swing_ticks + jnp.array([1, 0]))
     one = commanded(decided, memory, jnp.array(10), measurement)

@@ -218,7 +218,7 @@ def test_ten_iterations_go_below_a_hundred_of_the_papers():
         assert float(with_ridge.loss) <= 0.8 * start, name
 
 
-def test_other_numbers_step_by_a_share_of_their_box_and_what_is_not_tuned_stays():
+def test_other_numbers_move_by_shares_of_their_box_by_either_rule_and_what_is_not_tuned_stays():
     config = TuneConfig(rule="relative", others=("turn_lead", "footstep_feedback"))
     start = nominal()._replace(others={"friction": 0.4})
     begun = {name: float(x) for name, x in init(config, start).start.others.items()}
@@ -234,9 +234,6 @@ def test_other_numbers_step_by_a_share_of_their_box_and_what_is_not_tuned_stays(
     assert moved.others["friction"] == 0.4
     far = stepped_once(gradient, replace(config, beta_others=10.0), start)
     assert far.others["turn_lead"] == 2.0
-
-
-def test_a_trust_region_holds_shares_of_boxes_as_it_holds_logs():
     config = TuneConfig(others=("turn_lead",))
     slope = random_tree(0, 0.0)._replace(others={"turn_lead": jnp.array(-100.0)})
     moved = stepped_once(slope, config)

@@ -49,10 +49,6 @@ def solve(*args):
     return answer(*args)[0]
 
 
-def write(*args):
-    return answer(*args)[1]
-
-
 linearise = jax.jit(jax.vmap(lambda e, r: srbm.linearise(ROBOT, e, r, DT)))
 
 
@@ -272,7 +268,7 @@ def test_costs_of_ones_own_are_added_to_those_of_the_weights():
         assert np.abs(plain.x - expected.x).max() > 0.1
 
 
-def test_constraints_are_chosen_by_name_and_none_are_those_of_the_contact_model():
+def test_constraints_are_chosen_by_name_and_are_else_those_of_the_contact_model():
     names = ["friction", "unilateral_force", "line_pressure", "line_friction"]
     table = {"contact": "line", "constraints": names}
     assert from_table("robot.toml", MpcConfig, table) == CONFIG
@@ -282,9 +278,6 @@ def test_constraints_are_chosen_by_name_and_none_are_those_of_the_contact_model(
     assert pickle.loads(pickle.dumps(CONFIG)) == CONFIG
     assert [str(one) for one in MpcConfig(line_friction=False).on("inputs")] == names[:3]
     assert replace(MpcConfig(line_friction=False), line_friction=True) == MpcConfig()
-
-
-def test_a_config_with_another_contact_model_has_the_constraints_of_that_one():
     flat = replace(MpcConfig(), contact=FLAT_FOOT)
     assert (flat, flat.constraints) == (MpcConfig(contact=FLAT_FOOT), FLAT_FOOT.constraints)
     assert replace(flat, contact=LINE_FOOT, friction=0.5) == MpcConfig(friction=0.5)

@@ -184,7 +184,9 @@ def test_the_report_tells_what_was_promised_and_what_is_particular_to_a_run(tmp_
     assert "\n*" not in text.replace("\n*Loss", "")
 
 
-def test_the_report_opens_with_errors_falls_and_what_to_do_next(tmp_path):
+def test_the_report_opens_with_errors_falls_and_the_next_step_and_says_below_only_where_it_is(
+    tmp_path,
+):
     verdict = pretend_verdict(fallen={("expert", 0)})
     lines = report.first_lines(verdict, "latest")
     of = report.plain_errors(verdict, "with")
@@ -193,9 +195,6 @@ def test_the_report_opens_with_errors_falls_and_what_to_do_next(tmp_path):
     assert lines[1].endswith("the tuning has not seen: with 0, nominal 0, expert 1.")
     assert all(f"`hector {name} latest`" in lines[2] for name in ("view", "export"))
     assert written(tmp_path, verdict).split("\n\n")[1:4] == lines
-
-
-def test_the_report_says_below_only_where_the_loss_is_below(tmp_path):
     verdict = pretend_verdict()
     swapped = {"nominal": verdict.scores["with"], "with": verdict.scores["nominal"]}
     text = written(tmp_path, verdict._replace(scores=verdict.scores | swapped))

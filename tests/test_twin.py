@@ -70,20 +70,14 @@ def test_what_the_command_leaves_at_rest_keeps_to_the_path():
     assert abs(both.position[0, 1] - path.position[0, 1]) < 0.01
 
 
-def test_the_target_of_a_late_step_is_that_of_the_step_before():
+def test_late_targets_frozen_linearisations_and_contacts_at_a_share_of_a_step_are_as_asked_for():
     on_time, late = (horizon(twin(late=late)).reference for late in (0, 1))
     for now, then in zip(on_time, late, strict=True):
         np.testing.assert_array_equal(then[1:], now[:-1])
-
-
-def test_a_frozen_linearisation_is_that_of_the_present_in_all_steps():
     found = horizon(twin(linearisation=FROZEN))
     np.testing.assert_allclose(found.euler, np.tile(STATE.euler, (10, 1)))
     np.testing.assert_allclose(found.lever, np.tile(FEET.position - STATE.position, (10, 1, 1)))
     np.testing.assert_allclose(found.foot_yaw, 0.2)
-
-
-def test_contacts_are_those_at_the_share_of_a_step_that_is_asked_for():
     # steps of 3 ticks from tick 18 on; the feet change at 20 and at 40, within the step from 39 on
     begin, middle = (horizon(twin(contact_at=x), 18).contact[:, 0] for x in (0.0, 0.5))
     np.testing.assert_array_equal(np.flatnonzero(begin != middle), [7])
@@ -184,14 +178,11 @@ def test_a_twin_of_another_kind_is_told_where_it_differs(walked, tmp_path, monke
         assert told in lines
 
 
-def test_a_twin_file_is_read_as_a_robots():
-    config = walk_config(load_robot(OWN / "twin.toml"))
+def test_a_twin_file_is_read_as_a_robots_and_nothing_is_said_of_its_motors(monkeypatch, capsys):
+    config = walk_config(robot := load_robot(OWN / "twin.toml"))
     assert config.twin == TwinConfig(FROM_ROBOT, linearisation=FROZEN, contact_at=0.0, plan_ticks=2)
     assert config.plan_interval == pytest.approx(0.01)
-    assert rollout_config(load_robot(OWN / "twin.toml")).ticks == 800  # 4 s
-
-
-def test_nothing_is_said_of_the_motors_of_a_twin_whose_legs_are_anothers(monkeypatch, capsys):
+    assert rollout_config(robot).ticks == 800  # 4 s
     assert call(monkeypatch, "robot", OWN / "twin.toml") == 0
     lines = capsys.readouterr().out
     assert "own_controller: 12 kg" in lines

@@ -410,7 +410,7 @@ def test_the_record_of_another_tuning_is_refused_in_one_line(toy, change, words)
     assert files(one.folder) == before
 
 
-def test_a_record_or_a_log_that_is_damaged_is_refused_in_one_line(toy):
+def test_a_record_a_log_or_weights_that_are_damaged_or_others_are_refused_in_one_line(toy):
     walks.tune_on_walks(HERE, one := toy(), walks=6)
     log, record = one.folder / "logs" / "1-0.npz", one.folder / "walks.jsonl"
     whole = log.read_bytes()
@@ -422,10 +422,7 @@ def test_a_record_or_a_log_that_is_damaged_is_refused_in_one_line(toy):
     record.write_text("\n".join([lines[0], "{", ""]))
     with pytest.raises(InputError, match=r"walks.jsonl, line 2: a row of a tuning on walks"):
         walks.tune_on_walks(HERE, one, walks=6)
-
-
-def test_weights_in_the_folder_that_have_other_numbers_are_refused_in_one_line(toy):
-    walks.tune_on_walks(HERE, one := toy(), walks=6)
+    record.write_text("\n".join([*lines, ""]))
     path = walks.weights_path(one.folder, 1)
     wide = load_weights(path)._replace(others={"footstep_width": np.array(0.07)})
     save_weights(path, wide)
