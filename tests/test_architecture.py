@@ -62,7 +62,7 @@ def test_each_outside_package_has_its_door(package):
     assert not {name for name in importers(package) if not name.startswith(DOORS[package])}
 
 
-def test_nothing_that_learns_or_searches_can_reach_the_stand_in():
+def test_nothing_that_learns_can_reach_the_stand_in_nor_the_package_a_script():
     assert importers("hector_jax.sim.standin") == {"cli.arguments"}
     knowing = {
         path.stem
@@ -71,9 +71,6 @@ def test_nothing_that_learns_or_searches_can_reach_the_stand_in():
         if any(name.startswith("hector_jax.sim.standin") for name in imported(path))
     }
     assert knowing == {"robustness", "pictures", "golden"}
-
-
-def test_the_package_imports_no_script():
     scripts = [path.stem for path in (ROOT.parent / "experiments").glob("*.py")]
     assert not [name for name in ("experiments", *scripts) if importers(name)]
 

@@ -27,7 +27,7 @@ def weak(window: Window):
     return ground_effect(wrench._replace(force=0.9 * wrench.force, moment=moment))
 
 
-def test_a_robot_too_low_lacks_force_and_is_seen_in_its_yaw_frame():
+def test_a_robot_too_low_lacks_force_in_its_yaw_frame_and_a_push_counts_less_than_a_steady_error():
     heading = np.array([0.0, 0.0, np.pi / 2])  # it looks along y
     there = AT_REST._replace(euler=heading, position=np.array([0.0, -0.01, -0.02]))
     wanted = AT_REST._replace(euler=heading)
@@ -37,8 +37,6 @@ def test_a_robot_too_low_lacks_force_and_is_seen_in_its_yaw_frame():
     np.testing.assert_allclose(found.linear[1], 0.0, atol=1e-15)
     np.testing.assert_allclose(found.angular, 0.0, atol=1e-15)
 
-
-def test_what_a_push_leaves_counts_less_than_a_steady_error():
     def counts(error):
         tilted = AT_REST._replace(euler=np.full(3, error))
         return integrate(INTEGRAL, NO_DISTURBANCE, tilted, AT_REST, 0.01).angular

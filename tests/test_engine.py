@@ -36,13 +36,10 @@ def test_auto_is_mjx_where_there_is_an_accelerator(monkeypatch):
         assert (engine.bits(False), engine.bits(True)) == (bits, 64)
 
 
-def test_an_engine_that_is_not_installed_says_what_to_install(monkeypatch):
+def test_an_engine_that_is_not_installed_or_of_other_people_is_named_with_the_remedy(monkeypatch):
     monkeypatch.setitem(ENGINES, "drake", ENGINES["drake"]._replace(package="no-such-package"))
     with pytest.raises(InputError, match=r"no-such-package, .*: pip install -e '.\[drake\]'"):
         choose_engine("drake")
-
-
-def test_a_package_of_the_same_name_of_other_people_is_named(monkeypatch):
     for name in ("pinocchio", "coal"):
         monkeypatch.setitem(sys.modules, name, SimpleNamespace(__file__="other.py"))
     monkeypatch.delitem(sys.modules, "hector_jax.sim.pinocchio", raising=False)

@@ -61,14 +61,11 @@ def test_the_sway_of_this_moment_carries_one_swing_at_most():
     assert left[2] - left[3] == pytest.approx(0.03)
 
 
-def test_in_a_turn_the_feet_land_on_the_outside():
+def test_in_a_turn_feet_land_on_the_outside_and_point_to_the_heading_of_the_middle_of_stance():
     now = state(velocity=(0.5, 0.0, 0.0), yaw_rate=1.0)
     points, straight = feet(now, now)[0], feet(now, now, FootstepConfig(turn=0.0))[0]
     lean = 0.5 * 0.5 * 0.5 / ROBOT.gravity[2]
     np.testing.assert_allclose(points - straight, [[0.0, -lean, 0.0]] * 2, atol=1e-12)
-
-
-def test_a_foot_points_to_the_heading_of_the_middle_of_its_stance():
     _, yaw = feet(state(yaw=0.2), state(yaw_rate=2.0))
     np.testing.assert_allclose(yaw, 0.2 + 2.0 * (np.asarray(WAIT) + STANCE / 2))
 

@@ -58,7 +58,9 @@ def evaluate(grounding, weights):
     return evaluate_jit(BRIEF, grounding, weights, PAPER_LOSS, walk=grounded_rollout)
 
 
-def test_its_gradient_is_that_of_differences(grounding):
+def test_its_gradient_is_that_of_differences_and_its_matrix_has_all_numbers_and_is_positive(
+    grounding,
+):
     theta = np.asarray(weights_to_vector(nominal()))
 
     def loss(logs):
@@ -70,9 +72,6 @@ def test_its_gradient_is_that_of_differences(grounding):
     for direction in np.linalg.qr(np.random.default_rng(0).normal(size=(24, 3)))[0].T:
         expected = (loss(1e-5 * direction) - loss(-1e-5 * direction)) / 2e-5
         assert slope @ direction == pytest.approx(expected, rel=1e-5)
-
-
-def test_its_matrix_has_a_row_for_each_tuned_number_and_is_positive(grounding):
     weights = BRIEF.walk.with_others(nominal(), ["turn_lead"])
     options = {"walk": grounded_rollout, "others": ("turn_lead",)}
     matrix = np.asarray(least_squares_jit(BRIEF, grounding, weights, PAPER_LOSS, **options)[1])

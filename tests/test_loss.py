@@ -10,7 +10,7 @@ from model import ANCHOR, ROBOT
 from pretend import pretend_walk
 
 from hector_jax import PAPER_LOSS, InputError, LossTerm, last_command, named_command, nominal
-from hector_jax.core.trajectory import State, Wrench, no_samples
+from hector_jax.core.trajectory import State, Wrench, has_fallen, no_samples
 from hector_jax.report.report import render
 from hector_jax.store.folder import as_row
 from hector_jax.tuning.difftune import TuneConfig, tune
@@ -80,14 +80,11 @@ def test_the_same_errors_cost_the_same_at_any_sampling():
         close(parts_of(fallen_from(slow, sample)), parts_of(fallen_from(fast, 10 * sample)))
 
 
-def test_after_a_fall_each_sample_is_charged_a_fixed_error_at_least():
+def test_after_a_fall_each_sample_is_charged_a_fixed_error_whatever_the_robot_does():
     for error, euler, position in ((0.1, 0.8**2, 0.5**2), (2.0, 3 * 4.0, 3 * 4.0)):
         parts = parts_of(fallen_from(off_by(walk(), error, error), 4))
         assert parts["L_Eul"] == pytest.approx(10 * (4 * 3 * error**2 + 2 * euler))
         assert parts["L_pos"] == pytest.approx(10 * (4 * 3 * error**2 + 2 * position))
-
-
-def test_what_a_fallen_robot_does_is_not_looked_at():
     trajectory = fallen_from(walk(), 3)
     nonsense = np.where(trajectory.fallen[:, None], np.nan, 0.0)
     wild = Wrench(*(w + nonsense[:, None] for w in trajectory.command))
@@ -156,3 +153,18 @@ def test_terms_that_cannot_be_told_apart_are_refused():
     for loss in ((*PAPER_LOSS, PAPER_LOSS[0]), (LossTerm("sway", "", 1.0, sway),)):
         with pytest.raises(InputError, match="unlike names"):
             TuneConfig(loss=loss)
+
+
+def test_a_fall_is_a_fall():
+    zero = np.zeros(3)
+    upright = State(zero, np.array([0.0, 0.0, 0.41]), zero, zero)
+    for fell, change in (
+        (False, {}),
+        (False, {"euler": [0.7, -0.7, 3.0]}),
+        (True, {"position": [0.0, 0.0, 0.24]}),
+        (True, {"euler": [0.0, -0.81, 0.0]}),
+        (True, {"euler": [0.81, 0.0, 0.0]}),
+        (True, {"velocity": [0.0, np.nan, 0.0]}),
+    ):
+        changed = {name: np.array(value) for name, value in change.items()}
+        assert has_fallen(upright._replace(**changed)) == fell

@@ -184,9 +184,7 @@ def test_the_gated_map_finds_a_ground_that_is_gated_and_linear(data, windows, ga
     assert np.abs(error).max() < 0.02 * told.touchdown_error[lands].std()
 
 
-def test_a_command_that_stays_is_returned_as_it_is_and_a_leg_pushes_only_while_it_swings(
-    gated, window
-):
+def test_a_command_that_stays_is_returned_and_a_leg_pushes_only_while_it_swings(gated, window):
     held = jax.tree.map(lambda w: jnp.broadcast_to(w[:1], w.shape), window.commands)
     more = jax.tree.map(lambda w: w.at[:, 0].add(3.0), held)
     phi = as_effect(gated)

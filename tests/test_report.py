@@ -184,9 +184,7 @@ def test_the_report_tells_what_was_promised_and_what_is_particular_to_a_run(tmp_
     assert "\n*" not in text.replace("\n*Loss", "")
 
 
-def test_the_report_opens_with_errors_falls_and_the_next_step_and_says_below_only_where_it_is(
-    tmp_path,
-):
+def test_the_report_opens_with_errors_falls_and_the_next_step_and_says_below_where_it_is(tmp_path):
     verdict = pretend_verdict(fallen={("expert", 0)})
     lines = report.first_lines(verdict, "latest")
     of = report.plain_errors(verdict, "with")

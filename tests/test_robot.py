@@ -20,29 +20,23 @@ def body_pairs(model, data):
     return [tuple(model.body(b).name for b in pair) for pair in bodies]
 
 
-def test_standing_trunk_is_at_548_millimetres_with_both_soles_on_the_floor():
+def test_the_standing_robot_is_that_of_the_facts_sheet_and_its_own_mirror_image():
+    """MuJoCo's H, moved from the trunk's origin to the CoM; armature sits on joints only."""
     data = standing_data(Description(), MODEL)
     assert ROBOT.trunk_height == pytest.approx(0.548, abs=1e-3)
     for foot, side in zip([foot.point for foot in Description().named_feet], (1, -1), strict=True):
         there = [-0.0135, side * 0.0942, 0.0]
         np.testing.assert_allclose(data.site(foot).xpos, there, rtol=0, atol=1e-6)
     np.testing.assert_allclose(np.rad2deg(ROBOT.standing_joints), [0, 0, 45, -90, 45] * 2)
-
-
-def test_composite_body_is_that_of_the_facts_sheet_and_of_the_mass_matrix():
-    """MuJoCo's H, moved from the trunk's origin to the CoM; armature sits on joints only."""
     np.testing.assert_allclose(ROBOT.com_offset, [-0.011, 0.0, -0.125], atol=1e-3)
     np.testing.assert_allclose(np.diag(ROBOT.inertia), [0.321, 0.268, 0.120], atol=1e-3)
     assert ROBOT.inertia[0, 2] == pytest.approx(-0.027, abs=1e-3)
     assert ROBOT.standing_height == pytest.approx(0.548 - 0.125, abs=1e-3)
-    H = mass_matrix(MODEL, standing_data(Description(), MODEL))
+    H = mass_matrix(MODEL, data)
     S = np.cross(ROBOT.com_offset, np.eye(3)).T  # S(c) w = c x w
     np.testing.assert_allclose(H[:3, :3], ROBOT.mass * np.eye(3), atol=1e-12)
     np.testing.assert_allclose(H[:3, 3:6], -ROBOT.mass * S, atol=1e-12)
     np.testing.assert_allclose(H[3:6, 3:6], ROBOT.inertia - ROBOT.mass * S @ S, atol=1e-12)
-
-
-def test_robot_is_its_own_mirror_image():
     assert differences(ROBOT) == []
     np.testing.assert_allclose(ROBOT.com_offset[1], 0.0, atol=1e-15)
     np.testing.assert_allclose(ROBOT.inertia[[0, 1], [1, 2]], 0.0, atol=1e-15)

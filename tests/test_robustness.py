@@ -49,16 +49,13 @@ def test_a_set_is_judged_by_the_median_of_paired_ratios_and_plants_are_its_sampl
     assert np.isnan(alone.ratio.low)
 
 
-def test_whether_a_set_falls_more_often_is_an_exact_test_on_the_scenes_that_differ():
+def test_falling_more_often_is_an_exact_test_on_scenes_that_differ_corrected_step_by_step():
     base, ours = np.full((2, 4), 1e6), {(0, 0), (0, 1), (1, 2)}
     found = evaluate_level(scores(base, ours), scores(base, {(1, 2), (1, 3)}))
     assert (found.more, found.fewer) == (2, 1)
     assert found.p == pytest.approx(4 / 8)  # two or three of three
     same = evaluate_level(scores(base), scores(base))
     assert (same.more, same.fewer, same.p) == (0, 0, 1.0)
-
-
-def test_several_tests_are_corrected_step_by_step():
     assert significant([0.2, 0.012, 0.001, 0.02]) == [2, 1, 3]  # 0.05 / 4, / 3, / 2
     assert significant([0.013, 0.013, 0.013, 0.013]) == []
 

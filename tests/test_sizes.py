@@ -37,16 +37,13 @@ def factories(description):
     yield standin(1, description)
 
 
-def test_a_plant_has_the_sizes_of_its_robot():
+def test_plants_and_pushes_of_the_data_have_the_sizes_of_the_robot():
     for ours, theirs in zip(factories(LARGE), factories(Description()), strict=True):
         np.testing.assert_allclose(ours.joint_friction, 3.0 * theirs.joint_friction)
         np.testing.assert_allclose(ours.joint_damping, 2.0 * theirs.joint_damping)
         np.testing.assert_allclose(ours.trunk_com, 1.5 * theirs.trunk_com)
         named = {"joint_friction": 0, "joint_damping": 0, "trunk_com": 0}
         assert exactly(ours) | named == exactly(theirs) | named  # and nothing else
-
-
-def test_pushes_of_the_data_have_the_size_of_the_robot():
     robot = load_robot()
     large = robot._replace(description=replace(robot.description, plants=SIZES))
     ours, theirs = draw_jobs(0, 12, robot=large), draw_jobs(0, 12)

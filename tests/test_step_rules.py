@@ -153,15 +153,12 @@ def test_the_radius_follows_the_ratio_of_the_gains(ridge, ratio, change, accepte
     assert float(new.first) == 100.0
 
 
-def test_the_radius_grows_at_the_border_only_and_to_four_at_most():
+def test_the_radius_grows_at_the_border_only_to_four_at_most_and_shrinks_to_a_part_of_the_step():
     before, new, z = after(1.0, radius=0.5, stiffness=100.0)  # ends inside
     assert np.linalg.norm(z) < 0.5 * float(before.size)
     assert float(new.size) == float(before.size)
     for radius in (2.5, 4.0):
         assert float(after(1.0, radius=radius, stiffness=0.1)[1].size) == 4.0
-
-
-def test_a_wrong_step_inside_the_region_shrinks_it_to_a_part_of_the_step():
     for ratio, share in ((0.1, 1 / 4), (-1.0, 1 / 8)):
         _, new, z = after(ratio, radius=0.5, stiffness=100.0)
         assert float(new.size) == pytest.approx(share * np.linalg.norm(z))

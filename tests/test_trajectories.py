@@ -18,14 +18,6 @@ SLALOM = EXAMPLES / "slalom.toml"
 LIMITS = limits(ROBOT, GaitConfig())
 
 
-def test_the_example_is_a_command_of_six_seconds_that_ends_as_it_began():
-    found = command_of(str(SLALOM))
-    assert (found.name, found.seconds) == ("slalom", 6.0)
-    np.testing.assert_array_equal(found.command.velocity[-1], [0.2, 0.1])
-    end = reference_at(0.01, found.command, standing_anchor(ROBOT), 600.0)
-    assert end.euler[2] == pytest.approx(0.0, abs=1e-9)
-
-
 def test_the_limits_are_those_that_the_robot_was_seen_to_have():
     np.testing.assert_allclose(LIMITS, [1.55, 1.04, 1.20, 3.5], atol=0.01)
     slower = limits(ROBOT, GaitConfig(stance=40, swing=40))
@@ -77,9 +69,14 @@ def test_a_walk_is_as_long_as_its_file_says_and_limits_are_told(monkeypatch, cap
     assert walks == [6.0, 4.0, 1.0]
 
 
-def test_rollouts_are_as_long_as_the_file_says():
+def test_the_example_is_a_command_of_six_seconds_that_ends_as_it_began_and_rollouts_are_as_long():
+    found = command_of(str(SLALOM))
+    assert (found.name, found.seconds) == ("slalom", 6.0)
+    np.testing.assert_array_equal(found.command.velocity[-1], [0.2, 0.1])
+    end = reference_at(0.01, found.command, standing_anchor(ROBOT), 600.0)
+    assert end.euler[2] == pytest.approx(0.0, abs=1e-9)
     config = TuneConfig()
-    assert arguments.with_length(config, command_of(str(SLALOM))).rollout.ticks == 600
+    assert arguments.with_length(config, found).rollout.ticks == 600
     assert arguments.with_length(config, command_of("c")) == config
 
 

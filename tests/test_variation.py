@@ -25,8 +25,6 @@ SCENARIO = Scenario(ROBOT, named_command("s"), ANCHOR, last_command)
 FEET = jnp.array([[0.02, 0.08, 0.0], [-0.01, -0.08, 0.0]])
 DT = 0.01
 BELIEVED = jax.tree.map(jnp.asarray, no_variation())
-
-
 assert_same = partial(jax.tree.map, partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-12))
 
 
@@ -48,17 +46,11 @@ def moved(variation, now, before=None, feet_before=FEET):
     return moved_by(variation, ROBOT, tilted(), dt=DT, now=(now, FEET), before=before)
 
 
-def test_without_a_variation_the_body_moves_as_the_rigid_body():
+def test_the_body_moves_as_the_rigid_body_late_by_its_delay_and_less_where_it_is_heavier():
     assert_same(moved(BELIEVED, wrench(0)), srbm.step(ROBOT, tilted(), wrench(0), FEET, DT))
-
-
-def test_an_effect_late_by_a_tick_is_the_last_one_where_the_feet_were():
     late, there = BELIEVED._replace(delay=jnp.asarray(DT)), FEET + 0.1
     expected = srbm.step(ROBOT, tilted(), wrench(1), there, DT)
     assert_same(moved(late, wrench(0), wrench(1), there), expected)
-
-
-def test_a_heavier_body_falls_no_faster_and_is_pushed_less():
     heavy = BELIEVED._replace(mass=jnp.asarray(1.1), inertia=jnp.asarray(1.1))
     nothing = jax.tree.map(jnp.zeros_like, wrench(0))
     assert_same(moved(heavy, nothing), moved(BELIEVED, nothing))

@@ -53,7 +53,7 @@ def test_the_numbers_of_the_weights_are_those_of_plan_and_legs(short):
     assert np.abs(wider[..., 1]).max() > 0.005
 
 
-def test_the_robot_walks_ahead_upright_with_a_sample_each_millisecond(short):
+def test_the_robot_walks_upright_from_where_it_is_in_step_a_sample_each_millisecond(short):
     assert short.period == 0.001
     samples = jax.tree.leaves(short._replace(period=None, initial=None))
     assert all(leaf.shape[:1] == (500,) for leaf in samples)
@@ -62,15 +62,9 @@ def test_the_robot_walks_ahead_upright_with_a_sample_each_millisecond(short):
     assert np.abs(short.state.position - short.reference.position).max() < 0.08
     assert np.abs(short.state.euler - short.reference.euler).max() < 0.1
     assert short.state.position[-1, 0] - short.initial.position[0] > 0.15
-
-
-def test_the_reference_starts_where_the_robot_truly_is(short):
     start = short.reference.position[0] - 0.001 * short.reference.velocity[0]
     np.testing.assert_allclose(start[:2], short.initial.position[:2], atol=1e-9)
     assert start[2] == pytest.approx(float(ROBOT.standing_height))
-
-
-def test_stance_follows_the_gait_and_a_foot_in_the_air_is_told_nothing(short):
     left, right = short.contact.T
     np.testing.assert_array_equal(left, np.arange(500) % 400 < 200)
     np.testing.assert_array_equal(right, ~left)

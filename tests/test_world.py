@@ -92,7 +92,7 @@ def test_friction_holds_a_joint_and_damping_and_armature_slow_it_down():
         assert -0.1 < slow / free < most, name
 
 
-def test_mass_and_trunk_com_are_those_of_the_plant():
+def test_masses_trunk_and_floor_are_those_of_the_plant():
     shift = np.array([0.01, -0.005, 0.015])
     plain = build_world(ideal()).model
     heavy = build_world(ideal()._replace(mass=np.array(1.05), trunk_com=shift)).model
@@ -100,9 +100,6 @@ def test_mass_and_trunk_com_are_those_of_the_plant():
     np.testing.assert_allclose(heavy.body_inertia, 1.05 * plain.body_inertia)
     np.testing.assert_allclose(heavy.body_ipos[1] - plain.body_ipos[1], shift)
     np.testing.assert_allclose(heavy.body_subtreemass[0], 1.05 * plain.body_subtreemass[0])
-
-
-def test_the_floor_is_as_soft_and_as_slippery_as_the_plant_says():
     plant = ideal()._replace(contact_time=np.array(0.03), floor_friction=np.array(0.15))
     contact = stand(plant, steps=100)[1].contact
     assert len(contact.dist) == 4
