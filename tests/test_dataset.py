@@ -80,18 +80,6 @@ def test_an_interval_keeps_mean_wrenches_and_last_states():
     leaves_close(at_interval(coarse, 0.01), coarse, 0.0)
 
 
-def test_a_sample_is_the_newest_commands_and_the_effect_of_its_tick(three, data):
-    assert len(data.walk) == 3 * (TICKS - HISTORY + 1)
-    row = np.flatnonzero((data.walk == 1) & (data.tick == 7))[0]
-    to_world = turns(three.state.euler[1, 6, 2])
-    newest = three.command.force[1, [7, 6, 5]]
-    np.testing.assert_allclose(data.window.commands.force[row] @ to_world.T, newest, atol=1e-12)
-    label = data.label.moment[row] @ to_world.T
-    np.testing.assert_allclose(label, three.effect.moment[1, 7], atol=1e-12)
-    np.testing.assert_array_equal(data.state.velocity[row], three.state.velocity[1, 6])
-    np.testing.assert_array_equal(data.window.contact[:, 0], data.tick % CYCLE < CYCLE // 2)
-
-
 def test_the_time_since_a_switch_counts_from_the_start_tick(three):
     for starts in ([0, 0, 0], [0, 10, 30]):
         data, _ = make_dataset(ROBOT, three, start_tick=starts)
@@ -180,11 +168,18 @@ def test_a_collection_of_something_else_is_not_overwritten(tmp_path):
         collect(tmp_path, draw_jobs(0, 2), walker([]), robot=ROBOT)
 
 
-def test_the_legs_get_what_the_wrench_does_not_explain(three, data):
-    row, walk, j = np.flatnonzero((data.walk == 1) & (data.tick == 7))[0], 1, 7
-    at = lambda t: jax.tree.map(lambda s: jnp.asarray(s[walk, t]), three.state)  # noqa: E731
-    before, after = at(j - 1), at(j)
-    wrench = jax.tree.map(lambda w: jnp.asarray(w[walk, j]), three.effect)
-    feet = jnp.asarray(three.feet[walk, j - 1 : j + 1].mean(axis=0))
+def test_a_sample_is_the_newest_commands_the_effect_of_its_tick_and_what_the_legs_get(three, data):
+    assert len(data.walk) == 3 * (TICKS - HISTORY + 1)
+    row = np.flatnonzero((data.walk == 1) & (data.tick == 7))[0]
+    to_world = turns(three.state.euler[1, 6, 2])
+    newest = three.command.force[1, [7, 6, 5]]
+    np.testing.assert_allclose(data.window.commands.force[row] @ to_world.T, newest, atol=1e-12)
+    label = data.label.moment[row] @ to_world.T
+    np.testing.assert_allclose(label, three.effect.moment[1, 7], atol=1e-12)
+    np.testing.assert_array_equal(data.state.velocity[row], three.state.velocity[1, 6])
+    np.testing.assert_array_equal(data.window.contact[:, 0], data.tick % CYCLE < CYCLE // 2)
+    before, after = (jax.tree.map(lambda s, t=t: jnp.asarray(s[1, t]), three.state) for t in (6, 7))
+    wrench = jax.tree.map(lambda w: jnp.asarray(w[1, 7]), three.effect)
+    feet = jnp.asarray(three.feet[1, 6:8].mean(axis=0))
     push = srbm.unexplained(ROBOT, before, after, wrench, feet, dt=0.01)
     leaves_close(turn(push, -before.euler[2]), jax.tree.map(lambda x: x[row], data.legs), 1e-8)

@@ -37,16 +37,13 @@ def test_rotations_are_those_of_scipy_and_their_euler_angles_come_back():
         np.testing.assert_allclose(turn(jnp.array(0.7)), R, atol=1e-14)
 
 
-def test_wrapped_angles_are_the_same_angle_within_half_a_turn():
+def test_wrapped_angles_are_the_same_angle_within_half_a_turn_and_single_precision_stays():
     angle = jnp.linspace(-20.0, 20.0, 401)
     wrapped = wrap_angle(angle)
     assert ((wrapped >= -np.pi) & (wrapped < np.pi)).all()
     np.testing.assert_allclose(np.cos(wrapped), np.cos(angle), atol=1e-12)
     np.testing.assert_allclose(np.sin(wrapped), np.sin(angle), atol=1e-12)
     assert wrap_angle(jnp.array(0.3)) == pytest.approx(0.3)
-
-
-def test_single_precision_stays_single():
     euler = jnp.array([0.1, 0.2, 0.3], jnp.float32)
     for made in (rotation_from_euler(euler), euler_rates(euler), skew(euler), wrap_angle(euler)):
         assert made.dtype == jnp.float32

@@ -60,7 +60,7 @@ def test_the_fastest_joints_of_a_swing_leg_have_the_phase_margin():
     assert margin(joints, np.geomspace(5.0, 500.0, 4001)) == pytest.approx(PHASE_MARGIN, abs=0.01)
 
 
-def test_the_plan_keeps_the_phase_margin_with_its_share_of_the_inertia():
+def test_the_plan_turns_its_share_of_the_inertia_and_keeps_the_phase_margin_with_it():
     A, B = np.array([[1.0, 0.03], [0.0, 1.0]]), np.array([[0.0], [0.03]])
     P = solve_discrete_are(A, B, np.diag([50.0, 1.0]), [[1e-9]])  # nearly without a cost on u
     stiffness, damping = np.linalg.solve(B.T @ P @ B, B.T @ P @ A)[0]
@@ -72,9 +72,6 @@ def test_the_plan_keeps_the_phase_margin_with_its_share_of_the_inertia():
         return plan * np.exp(-(DELAY + 0.005) * s) / (1 + LAG * s)
 
     assert margin(loop) == pytest.approx(PHASE_MARGIN, abs=2e-3)
-
-
-def test_the_plan_turns_its_share_of_the_inertia():
     config = MpcConfig(inertia_share=(0.25, 1.0, 0.49))
     found = config.planned_inertia(np.ones((3, 3)))
     np.testing.assert_allclose(found[0], [0.25, 0.5, 0.35])

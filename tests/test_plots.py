@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
+from pictures import PICTURES, draw_method, draw_race
+from PIL import Image
 from pretend import elsewhere, pretend_history, pretend_walk
 
 from hector_jax import PAPER_LOSS, State
@@ -85,3 +87,14 @@ def test_the_same_picture_gives_the_same_bytes(tmp_path, walks, ending):
     for path in (one, other):
         plots.save_path(path, walks)
     assert one.read_bytes() == other.read_bytes()
+
+
+def test_pictures_of_the_pages_are_there_and_small_and_diagram_and_race_are_drawn_again(tmp_path):
+    for name, (path, _) in PICTURES.items():
+        assert 10_000 < path.stat().st_size < (1_000_000 if name == "film" else 400_000)
+    with Image.open(PICTURES["film"][0]) as film:
+        assert (film.n_frames, film.width >= 720) == (49, True)  # four seconds
+    draw_method(tmp_path / "method.svg")
+    draw_race(tmp_path / "race.png")
+    assert "<svg" in (tmp_path / "method.svg").read_text()
+    assert (tmp_path / "race.png").stat().st_size > 10_000

@@ -51,7 +51,7 @@ def test_feet_lift_in_the_order_of_the_gait(name, lifts, most):
     assert stands.sum(axis=1).max() == stands.sum(axis=1).min() == most == config.most_contacts
 
 
-def test_a_gait_that_cannot_be_is_refused():
+def test_a_gait_is_chosen_by_name_and_one_that_cannot_be_is_refused(monkeypatch, capsys):
     for wrong, words in (
         ({"pattern": "gallop"}, "must be 'walk', 'trot', 'pace' or 'crawl', got 'gallop'"),
         ({"pattern": (0.0, 0.5, 0.5)}, r"numbers in \[0, 1\), one for each of 2 or 4 feet"),
@@ -60,9 +60,6 @@ def test_a_gait_that_cannot_be_is_refused():
     ):
         with pytest.raises(InputError, match=words):
             GaitConfig(**wrong)
-
-
-def test_a_gait_is_chosen_by_name(monkeypatch, capsys):
     assert walk_config(with_gait(ROBOT, "own")).gait == CONFIG.gait
     assert walk_config(with_gait(ROBOT, "crawl")).gait == gait_named(CONFIG.gait, "crawl")
     words = f"walk --robot {FILE} --world srbm --seconds 0.3 --json --gait stand"

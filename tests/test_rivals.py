@@ -28,15 +28,12 @@ def test_cma_es_goes_downhill_inside_the_box():
     np.testing.assert_allclose(seen[-1], np.clip(GOAL, *BOX.T), atol=0.1)
 
 
-def test_a_fall_is_worse_than_all_walks_before_it():
+def test_a_fall_is_worse_than_all_before_it_and_the_best_so_far_passes_over_falls_and_an_end():
     falling = lambda point: np.inf if point[0] < 0.0 else bowl(point)  # noqa: E731
     seen, losses = search(RIVALS["random"], Task(falling, bowl, BOX, 1.0, 3), 20)
     falls = np.flatnonzero(seen[:, 0] < 0.0)
     assert len(falls) > 5
     assert [losses[fall] for fall in falls] == [losses[:fall].max() + 1.0 for fall in falls]
-
-
-def test_the_best_so_far_passes_over_falls_and_the_end_of_a_rival():
     losses = np.array([[6.0, np.inf, 5.0, 7.0, 4.0], [6.0, 5.0, 3.0, np.nan, np.nan]])
     own = {1: [6.0, 6.0], 2: [6.0, 5.0], 5: [4.0, 3.0]}
     assert race.entry(losses) == {"own": own, "falls": [1, 0]}

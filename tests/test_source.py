@@ -187,7 +187,7 @@ def test_a_keyframe_of_the_file_is_kept_when_joints_are_welded(tmp_path):
     np.testing.assert_array_equal(got.body_inertia, by_angles.body_inertia)
 
 
-def test_the_mass_of_a_urdf_is_that_of_all_its_links_whatever_is_drawn(tmp_path):
+def test_the_mass_of_a_urdf_is_that_of_all_its_links_and_one_beside_a_robot_is_left_out(tmp_path):
     drawn = '<visual><geometry><box size="0 0 0"/></geometry></visual></link>'
     urdf = urdf_of(mujoco.MjModel.from_xml_path(str(MODEL_PATH))).replace("</link>", drawn)
     held = LINK.replace("</i", '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></i')
@@ -195,9 +195,6 @@ def test_the_mass_of_a_urdf_is_that_of_all_its_links_whatever_is_drawn(tmp_path)
     masses = [float(x) for x in re.findall('<mass value="([^"]*)"', urdf)]
     model = compiled(by_numbers(tmp_path, urdf))
     assert model.body_mass.sum() == pytest.approx(sum(masses), rel=1e-12)
-
-
-def test_a_mass_beside_the_robot_is_left_out_and_told(tmp_path):
     lamp = '<body name="lamp"><geom size="1" mass="9" contype="0" conaffinity="0"/></body>'
     source = build_spec(small(tmp_path, more=f"<worldbody>{lamp}</worldbody>"))
     assert "left out, which no joint holds: lamp" in source.notes

@@ -134,8 +134,8 @@ def page(request):
     server.stop()
 
 
-def test_the_page_answers_its_own_origins_only(page):
-    import viser
+def test_the_page_answers_its_own_origins_only_and_no_client_opens_a_tunnel(page, monkeypatch):
+    import viser._viser
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
 
@@ -151,11 +151,6 @@ def test_the_page_answers_its_own_origins_only(page):
     assert all(map(opens, [None, *own]))
     foreign = "https://evil.example", f"http://evil.example:{page[2]}", "http://localhost:1", "null"
     assert not any(map(opens, foreign))
-
-
-def test_no_client_of_the_page_opens_a_tunnel(page, monkeypatch):
-    import viser._viser
-
     opened = []
     monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *_: opened.append(1))
     assert page[0].request_share_url() is None  # what a client's message calls

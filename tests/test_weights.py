@@ -18,19 +18,6 @@ from hector_jax.control.weights import (
 )
 
 
-def test_each_name_stands_where_its_weight_is():
-    numbers = dict(zip(weight_names(), range(24), strict=True))
-    weights = vector_to_weights(jnp.arange(24.0))
-    assert weights.Q.euler[2] == numbers["Q_yaw"]
-    assert weights.Q.position[0] == numbers["Q_x"]
-    assert weights.Q.ang_velocity[1] == numbers["Q_wy"]
-    assert weights.Q.velocity[2] == numbers["Q_vz"]
-    assert weights.R.force[0, 2] == numbers["R_Fz_left"]
-    assert weights.R.force[1, 0] == numbers["R_Fx_right"]
-    assert weights.R.moment[1, 1] == numbers["R_My_right"]
-    assert len(set(weight_names())) == 24
-
-
 @pytest.mark.parametrize("shape", [(24,), (3, 24), (2, 5, 24)])
 def test_vector_and_weights_are_the_same_numbers(shape):
     vector = np.random.default_rng(0).uniform(size=shape).astype(np.float32)
@@ -50,7 +37,17 @@ def test_named_weights_lie_inside_the_box_and_treat_both_feet_alike(weights):
         np.testing.assert_array_equal(kind[0], kind[1])
 
 
-def test_the_feet_share_their_weights_in_every_direction():
+def test_each_name_stands_where_its_weight_is_and_feet_share_theirs_in_every_direction():
+    numbers = dict(zip(weight_names(), range(24), strict=True))
+    weights = vector_to_weights(jnp.arange(24.0))
+    assert weights.Q.euler[2] == numbers["Q_yaw"]
+    assert weights.Q.position[0] == numbers["Q_x"]
+    assert weights.Q.ang_velocity[1] == numbers["Q_wy"]
+    assert weights.Q.velocity[2] == numbers["Q_vz"]
+    assert weights.R.force[0, 2] == numbers["R_Fz_left"]
+    assert weights.R.force[1, 0] == numbers["R_Fx_right"]
+    assert weights.R.moment[1, 1] == numbers["R_My_right"]
+    assert len(set(weight_names())) == 24
     steps = directions()
     assert len(direction_names()) == len(steps) == 18
     assert (steps.sum(axis=0) == 1).all()
