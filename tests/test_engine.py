@@ -1,7 +1,6 @@
 """Engines as values: what is chosen once and passed down, and how one is added."""
 
 import json
-import re
 import sys
 from types import SimpleNamespace
 
@@ -64,6 +63,3 @@ def test_a_walk_and_an_evaluation_take_an_engine_that_was_added(monkeypatch, cap
         assert call(monkeypatch, *words, "--weights", "nominal", *flags) == 0
         told = json.loads(capsys.readouterr().out)
         assert told.get("columns", [told])[0]["engine"] == "mjx"
-    for flag, value in (("--engine", "mjx"), ("--plant", str(ARMS))):
-        assert call(monkeypatch, "walk", "--world", "srbm", flag, value) == 2
-        assert re.search(f"{flag}.* needs a world", capsys.readouterr().err)

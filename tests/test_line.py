@@ -32,28 +32,6 @@ def test_flags_are_taken_in_any_order_and_spelling(line, flags):
     assert from_line(line.split()) == flags
 
 
-@pytest.mark.parametrize(
-    ("line", "fault"),
-    [
-        ("wlak", "unknown command 'wlak'; did you mean 'walk'?"),
-        ("walk --wrold hfs", "walk has no flag '--wrold'; did you mean '--world'?"),
-        ("walk --zzz", "walk has no flag '--zzz'; see hector walk --help"),
-        ("walk there", "walk does not expect 'there'; see hector walk --help"),
-        ("walk --seed", "Missing value for argument '--seed'. Expected 1 values."),
-        ("walk --seed 1 --seed 2", "--seed is given twice"),
-        ("evaluate --weights nominal nominal", "--weights names 'nominal' twice"),
-        ("view", "Missing from hector view: PATH folder of a run"),
-        ("walk --seconds long", "Error parsing --seconds: expected a number, got 'long'"),
-        ("walk --world moon", "invalid choice 'moon' for argument '--world'. Expected one of ('"),
-        ("walk --robot assets/hector.xml", "hector robot MODEL --out NAME.toml makes one, got"),
-        (f"walk --weights {300 * 'x'}.json", "cannot read the file: File name too long"),
-        (f"tune --resume {300 * 'x'}", "--resume must be the folder of a run of `hector tune`"),
-    ],
-)
-def test_a_wrong_word_is_one_line_with_the_nearest_name(monkeypatch, capsys, line, fault):
-    assert fault in refused(monkeypatch, capsys, *line.split())
-
-
 COUNTS = [
     (name, field.name)
     for name, kind in COMMANDS.items()
