@@ -10,13 +10,8 @@ import pytest
 from model import HEIGHT, ROBOT, WEIGHT
 
 from hector_jax import State, WalkConfig, named_command
-from hector_jax.control import Anchor, GaitConfig, actuate, expert, init_memory, plan, step_plan
-from hector_jax.control.controller import (
-    contacts_needed,
-    limit_distance,
-    measured_feet,
-    plan_horizon,
-)
+from hector_jax.control import Anchor, GaitConfig, actuate, controller, expert, init_memory
+from hector_jax.control.controller import plan, step_plan
 from hector_jax.control.legs import Measurement, stance_torques
 from hector_jax.control.mpc import Horizon, MpcConfig
 from hector_jax.control.parameters import TUNABLES, Q
@@ -28,7 +23,7 @@ CONFIG = WalkConfig()
 STRAIGHT = named_command("straight")
 ANCHOR = Anchor(jnp.array([0.0, 0.0, HEIGHT]), jnp.array(0.0), jnp.array(0))
 
-feet_of = jax.jit(lambda measurement: measured_feet(ROBOT, measurement))
+feet_of = jax.jit(lambda measurement: controller.measured_feet(ROBOT, measurement))
 
 
 @partial(jax.jit, static_argnames="max_contacts")
@@ -176,9 +171,9 @@ def test_an_error_beyond_the_limit_counts_as_the_limit():
     away = state._replace(position=state.position + jnp.array([0.3, -0.4, 0.02]))
     ahead = State(*jnp.zeros((4, 3, 3)))
     horizon = Horizon(ahead, ahead.euler, *[jnp.zeros((3, 2))] * 2, jnp.ones((3, 2), bool))
-    moved = limit_distance(horizon, away, state, 0.1).reference
+    moved = controller.limit_distance(horizon, away, state, 0.1).reference
     np.testing.assert_allclose(moved.position, [[0.24, -0.32, 0.0]] * 3, atol=1e-9)
-    place = lambda x: limit_distance(horizon, x, state, np.inf).reference.position  # noqa: E731
+    place = lambda x: controller.limit_distance(horizon, x, state, np.inf).reference.position  # noqa: E731
     unlimited = jax.grad(lambda x: place(x)[0, 0])
     assert not any(part.any() for part in unlimited(state))  # and is finite without an error
 
@@ -189,7 +184,7 @@ def test_a_foot_that_lands_twice_within_the_horizon_lands_a_stride_further():
     walking = jax.tree.map(jnp.asarray, standing())
     state = walking.state._replace(velocity=jnp.array([0.5, 0.0, 0.0]))
     asked = {"command": STRAIGHT, "anchor": ANCHOR, "tick": jnp.array(0)}
-    ahead_of = jax.jit(partial(plan_horizon, config, ROBOT, config.footstep.parameters))
+    ahead_of = jax.jit(partial(controller.plan_horizon, config, ROBOT, config.footstep.parameters))
     horizon, _, touchdown = ahead_of(**asked, state=state, feet=feet_of(walking))
     stands = np.asarray(horizon.contact)
     assert stands.sum(axis=1).tolist() == [1] * 15
@@ -200,9 +195,10 @@ def test_a_foot_that_lands_twice_within_the_horizon_lands_a_stride_further():
 
 
 def test_room_for_two_feet_is_needed_before_the_gait_and_in_double_support():
-    assert [contacts_needed(CONFIG, tick) for tick in (-110, -81, -80, 0, 400)] == [2, 2, 1, 1, 1]
+    needed = partial(controller.contacts_needed, CONFIG)
+    assert list(map(needed, (-110, -81, -80, 0, 400))) == [2, 2, 1, 1, 1]
     double = WalkConfig(gait=GaitConfig(stance=24, swing=16))
-    assert contacts_needed(double, 0) == 2
+    assert controller.contacts_needed(double, 0) == 2
 
 
 def test_a_stance_leg_pushes_as_planned_a_swing_leg_is_pulled_on_and_ticks_join():

@@ -405,10 +405,8 @@ def disturbances():
 def race():
     """Few walks, and other methods."""
     methods = report("race/nominal/race.json")["s"].items()
-    at = {
-        name: {walks: np.median(losses) / 1e6 for walks, losses in one["own"].items()}
-        for name, one in methods
-    }
+    median = lambda own: {walks: np.median(losses) / 1e6 for walks, losses in own.items()}  # noqa: E731
+    at = {name: median(one["own"]) for name, one in methods}
     ours, bayes = at.pop("tuner"), at["nominal turbo on model"]["200"]
     evolution = min(at[name]["200"] for name in ("nominal cma-es", "nominal lq-cma-es"))
     rival = min(one["200"] for one in at.values())
@@ -422,10 +420,8 @@ def race():
     yield README, f"| CMA-ES (better of plain and lq-CMA-ES) | 200: {evolution:.2f} |"
     best_walks = best_set.SETS * best_set.PLANTS + 3 * START_PLANTS  # one is not anew
     yield README, f"| `hector tune --walks` | 5: {ours['5']:.2f} |"
-    yield (
-        README,
-        f"| `hector tune` | {CollectConfig().walks} once, for the network, then {best_walks};",
-    )
+    once = f"{CollectConfig().walks} once, for the network"
+    yield README, f"| `hector tune` | {once}, then {best_walks};"
 
 
 ROBOTS = {"quadruped": "`examples/quadruped`", "go2": "Unitree Go2"}

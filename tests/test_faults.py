@@ -36,13 +36,9 @@ class Fault(IntEnum):
     FLAT = 5
 
 
-REASONS = {
-    Fault.STATE: "loss or gradient not finite",
-    Fault.GRADIENT: "loss or gradient not finite",
-    Fault.QP: "QP residual inf too large",
-    Fault.FALL: "the robot fell",
-    Fault.FLAT: "QP residual inf too large",
-}
+REASONS = dict.fromkeys((Fault.STATE, Fault.GRADIENT), "loss or gradient not finite")
+REASONS |= dict.fromkeys((Fault.QP, Fault.FLAT), "QP residual inf too large")
+REASONS |= {Fault.FALL: "the robot fell"}
 
 
 def told(fault=Fault.NONE, reach=0.0):

@@ -21,13 +21,8 @@ def test_the_guess_is_the_active_set_of_the_solution(dtype):
         A = qp.A * column.reshape(len(qp.A), 1, -1)
         row = 1.0 / np.linalg.norm(A, axis=2)
         size = np.abs(column * qp.q).max()
-        normal = (
-            column[:, None] * qp.P * column,
-            column * qp.q / size,
-            row[..., None] * A,
-            row.ravel() * qp.l / size,
-            row.ravel() * qp.u / size,
-        )
+        normal = [column[:, None] * qp.P * column, column * qp.q / size, row[..., None] * A]
+        normal += [row.ravel() * bound / size for bound in (qp.l, qp.u)]
         cases.append([np.asarray(part, dtype) for part in normal])
         y = exact_solution(qp)[1]
         truth.append(np.where(np.abs(y) > 1e-9 * np.abs(y).max(initial=1.0), np.sign(y), 0))

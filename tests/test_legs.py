@@ -9,15 +9,8 @@ import numpy as np
 import pytest
 from model import QUADRUPED, ROBOT, WEIGHT
 
-from hector_jax.control import LegConfig, Measurement
+from hector_jax.control import LegConfig, Measurement, legs
 from hector_jax.control.footstep import Feet
-from hector_jax.control.legs import (
-    joint_torques,
-    stance_torques,
-    swing_joints,
-    swing_path,
-    trunk_position,
-)
 from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.trajectory import State, Wrench
 from hector_jax.robot.checks import standing_data
@@ -28,25 +21,21 @@ CONFIG = LegConfig()
 SWING = 0.2
 STANDS = jnp.asarray(ROBOT.standing_joints)
 
-stance = jax.jit(lambda state, joints, wrench: stance_torques(ROBOT, state, joints, wrench))
-path = jax.jit(lambda start, end, s: swing_path(CONFIG.parameters, start, end, s))
-targets = jax.jit(
-    lambda state, start, start_yaw, end, end_yaw, elapsed: swing_joints(
-        ROBOT,
-        CONFIG.parameters,
-        Measurement(state, STANDS, 0 * STANDS),
-        start=Feet(start, start_yaw),
-        end=Feet(end, end_yaw),
-        elapsed=elapsed,
-        swing=SWING,
-    )
-)
+stance = jax.jit(lambda state, joints, wrench: legs.stance_torques(ROBOT, state, joints, wrench))
+path = jax.jit(lambda start, end, s: legs.swing_path(CONFIG.parameters, start, end, s))
+
+
+@jax.jit
+def targets(state, start, start_yaw, end, end_yaw, elapsed):
+    at, feet = Measurement(state, STANDS, 0 * STANDS), {"start": Feet(start, start_yaw)}
+    feet["end"] = Feet(end, end_yaw)
+    return legs.swing_joints(ROBOT, CONFIG.parameters, at, **feet, elapsed=elapsed, swing=SWING)
 
 
 @partial(jax.jit, static_argnums=0)
 def torques(config, measurement, contact, wrench, target):
     now = {"contact": contact, "wrench": wrench, "target": target}
-    return joint_torques(ROBOT, config.parameters, measurement, **now)
+    return legs.joint_torques(ROBOT, config.parameters, measurement, **now)
 
 
 poses = jax.jit(lambda joints: foot_poses(ROBOT, joints))
@@ -62,7 +51,7 @@ def base(euler=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0)):
 def world_feet(state, joints):
     """Foot points and foot axes in the world."""
     R_wb, local = rotation_from_euler(state.euler), poses(joints)
-    return trunk_position(ROBOT, state) + local.position @ R_wb.T, R_wb @ local.rotation
+    return legs.trunk_position(ROBOT, state) + local.position @ R_wb.T, R_wb @ local.rotation
 
 
 START, _ = world_feet(base(), STANDS)
@@ -116,7 +105,7 @@ def test_stance_torques_and_leg_weight_are_the_statics_of_mujoco(robot, share):
     need, state, wrench = statics(robot, share)
     joints = jnp.asarray(robot.standing_joints)
     weight = jax.jit(leg_gravity)(robot, joints, jnp.asarray(robot.gravity))
-    found = jax.jit(stance_torques)(robot, state, joints, wrench) + weight
+    found = jax.jit(legs.stance_torques)(robot, state, joints, wrench) + weight
     np.testing.assert_allclose(found, need, atol=1e-8)
 
 

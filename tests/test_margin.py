@@ -10,16 +10,10 @@ from scipy.linalg import solve_discrete_are
 
 from hector_jax.control import MpcConfig, nominal, walk_config
 from hector_jax.core.inputs import InputError
+from hector_jax.robot import response as answers
 from hector_jax.robot.checks import standing_data
 from hector_jax.robot.model import compile_model
-from hector_jax.robot.response import (
-    DELAY,
-    LAG,
-    PHASE_MARGIN,
-    planned_inertia,
-    response,
-    swing_frequency,
-)
+from hector_jax.robot.response import DELAY, LAG, PHASE_MARGIN, response
 from hector_jax.sim.margin import Loops, delay_lines, modes
 
 RATES = np.geomspace(1.0, 1e3, 20001)  # [rad/s]
@@ -47,7 +41,7 @@ def margin(loop, rates=RATES):
 
 def test_the_fastest_joints_of_a_swing_leg_have_the_phase_margin():
     answer = response(QUADRUPED)
-    w, dofs = swing_frequency(answer), answer.swing_dofs
+    w, dofs = answers.swing_frequency(answer), answer.swing_dofs
     kp = answer.inertia[dofs - 6] * w**2
     motor = lambda s: np.exp(-(DELAY + 0.0005) * s) / (1 + LAG * s)  # noqa: E731
 
@@ -64,7 +58,8 @@ def test_the_plan_turns_its_share_of_the_inertia_and_keeps_the_phase_margin_with
     A, B = np.array([[1.0, 0.03], [0.0, 1.0]]), np.array([[0.0], [0.03]])
     P = solve_discrete_are(A, B, np.diag([50.0, 1.0]), [[1e-9]])  # nearly without a cost on u
     stiffness, damping = np.linalg.solve(B.T @ P @ B, B.T @ P @ A)[0]
-    share = planned_inertia(np.array([3.0, 1.0, 4.0]), angle=50.0, rate=1.0, step=0.03, tick=0.01)
+    times, of = {"step": 0.03, "tick": 0.01}, np.array([3.0, 1.0, 4.0])
+    share = answers.planned_inertia(of, angle=50.0, rate=1.0, **times)
     assert (share[1], share[0] / share[2]) == (1.0, pytest.approx(4.0 / 3.0))
 
     def loop(s):
@@ -85,15 +80,10 @@ def test_a_delayed_joint_is_stable_up_to_its_phase_margin():
     rate = RATES[np.abs(loop(1j * RATES)) >= 1.0][-1]
     critical = margin(loop) / rate  # the steps of plant and lag are as early as a command is late
     h = 0.001
-    parts = Loops(  # of a joint of unit inertia that is held at rest; nothing is planned
-        step=np.array([[1.0, h], [0.0, 1.0]]),
-        push=np.array([[h * h], [h]]),
-        base=np.zeros((12, 2)),
-        held=np.zeros((1, 12)),
-        now=-np.array([[w**2, w]]),
-        substeps=10,
-        slowest=1.0,
-    )
+    # of a joint of unit inertia that is held at rest; nothing is planned
+    rest = {"base": np.zeros((12, 2)), "held": np.zeros((1, 12)), "substeps": 10, "slowest": 1.0}
+    step, push = np.array([[1.0, h], [0.0, 1.0]]), np.array([[h * h], [h]])
+    parts = Loops(step=step, push=push, now=-np.array([[w**2, w]]), **rest)
     for delay, sign in ((critical - 0.0003, -1), (critical + 0.0003, 1)):
         first = modes(parts, delay, lag=0.004)[0]
         assert np.sign(first.real) == sign

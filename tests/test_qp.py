@@ -6,17 +6,9 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracles
 import pytest
-from oracles import (
-    central_difference,
-    condensed_walk,
-    dense_rows,
-    exact_solution,
-    general_qp,
-    kkt_residual,
-    other_minimiser,
-    walking_qp,
-)
+from oracles import exact_solution, walking_qp
 
 from benchmarks.problems import draw_problems, layer_qp
 from hector_jax import WalkConfig, load_robot
@@ -66,7 +58,7 @@ def still(qp):
 @cache
 def general(n, m):
     """EACH general QPs with their minimisers and conditions, and what is found of them."""
-    made = [general_qp(seed, n, m) for seed in range(EACH)]
+    made = [oracles.general_qp(seed, n, m) for seed in range(EACH)]
     return made, solve_all([qp for qp, _, _ in made])
 
 
@@ -110,7 +102,7 @@ def test_general_qps_are_right(n, m):
     assert (found.status[definite] == Status.SOLVED).all()
     assert np.isin(found.status, (Status.SOLVED, Status.NOT_UNIQUE)).all()
     for i, (qp, x, cond) in enumerate(made):
-        residual = kkt_residual(qp, found.x[i], found.y[i])
+        residual = oracles.kkt_residual(qp, found.x[i], found.y[i])
         assert residual <= (1e-8 if cond <= 1e4 else 1e-6), (i, residual, cond)
         if cond <= 1e4:
             np.testing.assert_allclose(found.x[i], x, atol=1e-4 * np.abs(x).max())
@@ -120,7 +112,7 @@ def test_general_qps_are_right(n, m):
 def test_a_minimiser_is_not_unique_just_where_a_linear_program_finds_another(n, m):
     made, found = general(n, m)
     flat = [i for i, (_, _, cond) in enumerate(made) if np.isinf(cond)]
-    unique = np.array([other_minimiser(made[i][0], found.x[i]) < 1e-3 for i in flat])
+    unique = np.array([oracles.other_minimiser(made[i][0], found.x[i]) < 1e-3 for i in flat])
     np.testing.assert_array_equal(found.status[flat] == Status.SOLVED, unique)
     assert 10 < unique.sum() < len(flat) - 10
 
@@ -326,7 +318,7 @@ def test_rows_of_small_numbers_bind_bounds_move_and_crossed_ones_are_an_equality
 
 
 def test_condensed_walks_are_solved_though_the_first_rows_are_zeros():
-    walks = [condensed_walk(seed) for seed in range(EACH)]  # SHAPES[3], compiled once
+    walks = [oracles.condensed_walk(seed) for seed in range(EACH)]  # SHAPES[3], compiled once
     first = np.array([qp.u[:2].min() for qp in walks])
     assert (first < 0).sum() >= 5
     assert np.abs(first).max() < 1e-16
@@ -458,7 +450,8 @@ def test_each_status_has_its_meaning_and_is_documented():
 
 
 def test_block_rows_are_those_of_the_dense_matrix(walking, walked):
-    dense = solve_all([qp._replace(A=dense_rows(qp.A)) for qp in walking[:EACH]])  # SHAPES[5]
+    made = [qp._replace(A=oracles.dense_rows(qp.A)) for qp in walking[:EACH]]
+    dense = solve_all(made)  # of SHAPES[5]
     np.testing.assert_allclose(walked.x[:EACH], dense.x, atol=1e-8)
     np.testing.assert_allclose(walked.y[3], dense.y[3], atol=1e-8)  # unique, unlike some others
 
@@ -515,7 +508,7 @@ def test_derivative_is_that_of_an_exact_solver(walking):
         for tangent in tangents(seed, qp):
             _, moved = along(qp, tangent)
             # A change of the active set inside the step shows in the larger one only.
-            found = [central_difference(qp, tangent, step) for step in (1e-5, 1e-6)]
+            found = [oracles.central_difference(qp, tangent, step) for step in (1e-5, 1e-6)]
             size = np.linalg.norm(found[1])
             errors.append(min(np.linalg.norm(moved - f) for f in found) / size)
     assert np.median(errors) <= 1e-7, np.median(errors)
@@ -538,7 +531,7 @@ def test_forward_and_reverse_are_one_derivative(walking):
 
 @pytest.mark.parametrize("times", [1e3, 1e6])
 def test_a_q_that_is_too_large_makes_no_problem_infeasible_or_unbounded(times):
-    made = [general_qp(seed, 5, 12)[0] for seed in range(3 * EACH)]
+    made = [oracles.general_qp(seed, 5, 12)[0] for seed in range(3 * EACH)]
     found = solve_all([qp._replace(q=times * qp.q) for qp in made])
     assert np.isin(found.status, [Status.SOLVED, Status.NOT_UNIQUE]).all()
 

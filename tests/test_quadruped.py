@@ -115,11 +115,8 @@ def data():
 
 @pytest.fixture(scope="module")
 def nets(data):
-    made = {
-        "gated": fit_gated(data),
-        "residual": with_statistics(init(jax.random.key(0), 4, 3), data),
-    }
-    return jax.tree.map(np.asarray, made)
+    residual = with_statistics(init(jax.random.key(0), 4, 3), data)
+    return jax.tree.map(np.asarray, {"gated": fit_gated(data), "residual": residual})
 
 
 @pytest.mark.parametrize("variant", ["residual", "gated"])

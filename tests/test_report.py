@@ -28,17 +28,14 @@ def written(folder, verdict=None, **others):
     """The text of report.md."""
     history = pretend_history(14, refused=(3, 12))
     history[12] = history[12]._replace(status=np.array(StepStatus.UNSOLVED))
+    direction = Direction(0.25, 0.96, {"Q_pitch": 0.9, "Q_x": -0.4})
     tuning, small = tuning_of(history, bounds()[1]), np.array(Stop.SMALL_STEP)
     contents = {
         "trajectory": "straight",
         "verdict": verdict or pretend_verdict(),
         "tunings": {"without": tuning, "with": tuning._replace(stop=small), "best": tuning},
         "norms": {"without": {"L_Eul": 12.0, "L_pos": 7.0, "L_ctrl": 8e5}},
-        "determined": Determined(
-            [Direction(0.25, 0.96, {"Q_pitch": 0.9, "Q_x": -0.4})],
-            18,
-            {"Q_pitch": 0.9, "R_Mz": 0.1},
-        ),
+        "determined": Determined([direction], 18, {"Q_pitch": 0.9, "R_Mz": 0.1}),
         "errors": errors(),
         "pictures": [Picture("loss.png", "Loss by iteration.")],
         "film": "no film: MuJoCo cannot draw here (egl: no device)",
@@ -168,14 +165,9 @@ def test_the_report_tells_what_was_promised_and_what_is_particular_to_a_run(tmp_
     touch = verdict.scores["with"]._replace(legs_touch=np.array([[0.03]] + [[0.0]] * 7))
     verdict = verdict._replace(scores=verdict.scores | {"with": touch}, loss=weighed)
     assert OF_WALKS.strip().splitlines()[-1] in printed(verdict)
-    text = written(
-        tmp_path,
-        verdict,
-        errors=errors(touchdown=[9.0, 4.0]),
-        film=Picture("film.mp4", "Before and after."),
-        walks=tuned_on_walks(),
-        begun_with="with",
-    )
+    more = {"film": Picture("film.mp4", "Before and after."), "walks": tuned_on_walks()}
+    more |= {"errors": errors(touchdown=[9.0, 4.0]), "begun_with": "with"}
+    text = written(tmp_path, verdict, **more)
     for words in OF_WALKS.strip().splitlines():
         assert words in text
     for block in text.split("\n\n"):  # every table is well formed

@@ -12,21 +12,9 @@ from test_sensing import stand
 
 from hector_jax import hfs, ideal
 from hector_jax.robot.model import quiet_mujoco
+from hector_jax.sim import world as worlds
 from hector_jax.sim.actuators import init_actuators, step_actuators
-from hector_jax.sim.world import (
-    MAX_DELAY,
-    NO_PUSH,
-    Push,
-    build_world,
-    hfs_drawn,
-    hfs_even,
-    hfs_varied,
-    hfs_with_motors,
-    noisy,
-    push_force,
-    standing_qpos,
-    truth,
-)
+from hector_jax.sim.world import MAX_DELAY, NO_PUSH, Push, build_world, push_force, standing_qpos
 
 KNEE = 3
 
@@ -148,10 +136,10 @@ MOTORS = {"delay": (0.001, 0.005), "lag": (0.002, 0.006)}
 @pytest.mark.parametrize(
     ("draw", "table"),
     [
-        (hfs_drawn, around(0.2)),
-        (hfs_varied, around(0.4)),
-        (hfs_with_motors, around(0.2) | MOTORS),
-        (hfs_even, around(0.4) | MOTORS | {"mass": (0.85, 1.15)}),
+        (worlds.hfs_drawn, around(0.2)),
+        (worlds.hfs_varied, around(0.4)),
+        (worlds.hfs_with_motors, around(0.2) | MOTORS),
+        (worlds.hfs_even, around(0.4) | MOTORS | {"mass": (0.85, 1.15)}),
     ],
 )
 def test_drawn_plants_fill_their_ranges_and_a_seed_is_a_plant(draw, table):
@@ -167,12 +155,12 @@ def test_drawn_plants_fill_their_ranges_and_a_seed_is_a_plant(draw, table):
 
 
 def test_plants_with_other_motors_masses_or_estimates_are_else_as_drawn():
-    drawn, motors, even = hfs_varied(3), hfs_with_motors(3, 0.4), hfs_even(3)
+    drawn, motors, even = worlds.hfs_varied(3), worlds.hfs_with_motors(3, 0.4), worlds.hfs_even(3)
     own = drawn._replace(delay=motors.delay, lag=motors.lag)
     jax.tree.map(np.testing.assert_array_equal, motors, own)
-    own = motors._replace(mass=even.mass, estimator=noisy())
+    own = motors._replace(mass=even.mass, estimator=worlds.noisy())
     jax.tree.map(np.testing.assert_array_equal, even, own)
-    assert drawn.estimator == truth()
+    assert drawn.estimator == worlds.truth()
 
 
 def test_a_wrong_number_is_refused_by_name():
