@@ -4,12 +4,12 @@ import jax
 import numpy as np
 import pytest
 from model import AHEAD, ANCHOR, BRIEF, PLAIN, ROBOT
-from pretend import elsewhere, no_belief
+from pretend import elsewhere, still_walk
 
 from hector_jax import PAPER_LOSS, Job, Scenario, hfs, named_command, walk
 from hector_jax.control.weights import nominal, vector_to_weights, weights_to_vector
 from hector_jax.control.weights_file import best
-from hector_jax.core.trajectory import State, Wrench, no_samples
+from hector_jax.core.trajectory import State, Wrench
 from hector_jax.tuning.curvature import least_squares_jit
 from hector_jax.tuning.evaluate import evaluate_jit
 from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
@@ -25,16 +25,9 @@ def shaking(size):
     shake = size * rng.standard_normal((ticks, 3))
     state = State(shake, shake + place, shake, shake)
     force = np.broadcast_to(np.asarray(ROBOT.mass * ROBOT.gravity) / 2, (ticks, 2, 3))
-    return no_samples(10, 2)._replace(
-        period=np.array(0.01),
-        initial=jax.tree.map(lambda x: x[0] - shake[0], state),
-        state=state,
-        command=Wrench(force, np.zeros_like(force)),
-        joints=np.broadcast_to(ROBOT.standing_joints, (ticks, 10)),
-        fallen=np.zeros(ticks, bool),
-        residual=np.zeros(ticks),
-        belief=no_belief(ticks),
-    )
+    parts = {"period": np.array(0.01), "initial": jax.tree.map(lambda x: x[0] - shake[0], state)}
+    parts["joints"] = np.broadcast_to(ROBOT.standing_joints, (ticks, 10))
+    return still_walk(ticks, state=state, command=Wrench(force, np.zeros_like(force)), **parts)
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,10 @@ import jax
 import numpy as np
 import pytest
 from model import ANCHOR, ROBOT
-from pretend import pretend_walk
+from pretend import pretend_walk, still_walk
 
 from hector_jax import PAPER_LOSS, InputError, LossTerm, last_command, named_command, nominal
-from hector_jax.core.trajectory import State, Wrench, has_fallen, no_samples
+from hector_jax.core.trajectory import State, Wrench, has_fallen
 from hector_jax.report.report import render
 from hector_jax.store.folder import as_row
 from hector_jax.tuning.difftune import TuneConfig, tune
@@ -33,15 +33,9 @@ def walk(count=6, period=0.01):
     zero = np.zeros((count, 3))
     state = State(zero, zero, zero, zero)
     load = np.tile([0.0, 0.0, 60.0], (count, 2, 1))
-    return no_samples(10, 2)._replace(
-        period=np.array(period),
-        initial=State(*np.zeros((4, 3))),
-        state=state,
-        reference=state,
-        command=Wrench(load, np.zeros_like(load)),
-        contact=np.ones((count, 2), bool),
-        fallen=np.zeros(count, bool),
-    )
+    parts = {"command": Wrench(load, np.zeros_like(load)), "initial": State(*np.zeros((4, 3)))}
+    parts |= {"contact": np.ones((count, 2), bool), "state": state, "reference": state}
+    return still_walk(count, period=np.array(period), **parts)
 
 
 def off_by(trajectory, euler=0.0, position=0.0):
