@@ -75,12 +75,8 @@ def test_the_ground_pulls_no_harder_than_its_friction_of_the_moment():
 
 def test_changes_begin_and_end_at_their_milliseconds_and_add_up():
     world = build_world(ideal())
-    changes = [
-        Change(start=0.1, end=0.15, floor_friction=0.4),
-        Change(start=0.12, payload=2.0),
-        Change(start=-5.0, slope=(0.01, 0.0)),
-        Change(start=9.0, payload=9.0),
-    ]
+    changes = [Change(start=0.1, end=0.15, floor_friction=0.4), Change(start=0.12, payload=2.0)]
+    changes += [Change(start=-5.0, slope=(0.01, 0.0)), Change(start=9.0, payload=9.0)]
     worlds = worlds_by_step(world, changes, -1100, 300)
     told = {
         step: (w.model.geom_friction[w.floor, 0], round(w.model.body_mass.sum() - 12.0))

@@ -24,11 +24,8 @@ def verdict(L, falls=0, **changes):
 
 
 def run_folder(folder, flags, versions, weight=1e5):
-    sets = {
-        "nominal": verdict(2e6),
-        "expert": verdict(1.5e6, nominal=-25.0),
-        "with": verdict(1e6, falls=1, nominal=-50.0, expert=-33.3),
-    }
+    sets = {"nominal": verdict(2e6), "expert": verdict(1.5e6, nominal=-25.0)}
+    sets["with"] = verdict(1e6, falls=1, nominal=-50.0, expert=-33.3)
     config = {"flags": as_table(flags), "tune": {"loss": {"euler": weight}}}
     write_json(folder / "result.json", {"alpha": {}, "sets": sets})
     write_json(folder / "config.json", config)
@@ -54,10 +51,8 @@ def test_a_comparison_tells_losses_falls_iterations_and_what_differs(monkeypatch
     assert one["sets"]["with"]["change"]["expert"]["median"] == -33.3
     assert [one["sets"]["with"][key] for key in ("falls", "seeds", "walks")] == [1, 2, 4]
     assert one["tuning"] == {"with": {"iterations": 2, "refused": 1}}
-    assert told["differ"] == {
-        "settings": {"flags.traj": [["straight"], ["c"]], "flags.seeds": [8, 32]},
-        "versions": {"commit": ["aaa", None]},
-    }
+    settings = {"flags.traj": [["straight"], ["c"]], "flags.seeds": [8, 32]}
+    assert told["differ"] == {"settings": settings, "versions": {"commit": ["aaa", None]}}
 
 
 @pytest.mark.parametrize(
@@ -79,9 +74,7 @@ def test_what_is_no_finished_run_is_told_by_its_file(runs, name, text, fault):
 
 @pytest.mark.parametrize(("weight", "said"), [(1e5, 0), (2e5, 1)])
 def test_runs_of_different_losses_are_said_to_be_so(monkeypatch, capsys, tmp_path, weight, said):
-    runs = [
-        run_folder(tmp_path / "one", Tune(), {}),
-        run_folder(tmp_path / "two", Tune(alpha="auto", seeds=32), {}, weight),
-    ]
+    two = run_folder(tmp_path / "two", Tune(alpha="auto", seeds=32), {}, weight)
+    runs = run_folder(tmp_path / "one", Tune(), {}), two
     assert call(monkeypatch, "evaluate", "--runs", *runs) == 0
     assert capsys.readouterr().out.count("losses differ") == said

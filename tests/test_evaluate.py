@@ -34,12 +34,8 @@ def cell(seeds=8, fallen=(), nominal=4e6, tuned=1e6):
 def test_cells_below_and_clear_and_void_are_counted():
     mixed = cell()
     mixed.scores["with"].losses["L"][:3] *= 8.0  # the median stays below, the interval does not
-    cells = {
-        (C, "s"): cell(),
-        (C, "c"): mixed,
-        (HEAVY, "s"): cell(fallen=[("with", 1)]),
-        (HEAVY, "c"): cell(tuned=5e6),
-    }
+    cells = {(C, "s"): cell(), (C, "c"): mixed, (HEAVY, "s"): cell(fallen=[("with", 1)])}
+    cells[HEAVY, "c"] = cell(tuned=5e6)
     assert matrix.tally(cells, "with", "nominal") == (4, 2, 1, 1, 1)
 
 
@@ -50,11 +46,8 @@ def test_plants_are_the_sample_of_falls_over_engines_and_trajectories_and_interv
     # P(X >= 1 | low) = P(X <= 1 | high) = 2.5 %
     assert 1.0 - (1.0 - one.low) ** 8 == pytest.approx(0.025)
     assert (1 - one.high) ** 8 + 8 * one.high * (1 - one.high) ** 7 == pytest.approx(0.025)
-    cells = {
-        (column, trajectory): cell(seeds, [("with", 0)])
-        for column, seeds in ((C, 8), (DRAKE, 4))
-        for trajectory in ("straight", "s")
-    }
+    cells = {(C, trajectory): cell(8, [("with", 0)]) for trajectory in ("straight", "s")}
+    cells |= {(DRAKE, trajectory): cell(4, [("with", 0)]) for trajectory in ("straight", "s")}
     assert matrix.falls(cells, "with") == (4, 24, 1, 8, matrix.fall_share(1, 8))
     cells[HEAVY, "s"] = cell(8, [("with", 0), ("with", 5)])
     assert matrix.falls(cells, "with") == (6, 32, 2, 8, matrix.fall_share(2, 8))

@@ -32,12 +32,8 @@ def test_flags_are_taken_in_any_order_and_spelling(line, flags):
     assert from_line(line.split()) == flags
 
 
-COUNTS = [
-    (name, field.name)
-    for name, kind in COMMANDS.items()
-    for field in fields(kind)
-    if type(field.default) is int
-]
+FLAGS = [(name, field) for name, kind in COMMANDS.items() for field in fields(kind)]
+COUNTS = [(name, field.name) for name, field in FLAGS if type(field.default) is int]
 
 
 @pytest.mark.parametrize(("command", "name"), COUNTS)
@@ -118,8 +114,7 @@ def test_a_path_with_an_equals_sign_is_a_file_where_there_is_one(monkeypatch, tm
 
 NAMES_OF_FILES = [
     (name, "" if field.default is MISSING else f"--{field.name}")
-    for name, kind in COMMANDS.items()
-    for field in fields(kind)
+    for name, field in FLAGS
     if "Path" in str(field.type) or "Source" in str(field.type)
 ]
 

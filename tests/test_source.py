@@ -215,13 +215,10 @@ def test_names_are_the_files_own_and_what_has_none_gets_one(tmp_path):
     ]
     path.write_text(replaced(path.read_text(), *changes))
     names = {"left_knee": "base", "right_ankle": "floor", "waist": "joint_5"}
-    renamed = replace(
-        description,
-        joints=tuple(names.get(x, x) for x in description.joints),
-        weld=("joint_5", "shoulder"),
-        standing=tuple((names.get(x, x), angle) for x, angle in description.standing),
-    )
-    got = compiled(renamed)
+    joints = tuple(names.get(x, x) for x in description.joints)
+    stands = tuple((names.get(x, x), angle) for x, angle in description.standing)
+    weld = ("joint_5", "shoulder")
+    got = compiled(replace(description, joints=joints, weld=weld, standing=stands))
     for name in ("body_mass", "body_inertia", "jnt_range", "key_qpos", "geom_size"):
         np.testing.assert_array_equal(getattr(got, name), getattr(expected, name))
     assert len({got.body(b).name for b in range(got.nbody)}) == got.nbody

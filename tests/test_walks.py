@@ -31,7 +31,7 @@ from hector_jax.walk_tuning.best_set import drawn_plants
 
 # all walks of this file are of these ticks and this command: one set of programs for all tests
 CONFIG, COMMAND, SECONDS = TuneConfig(rollout=BRIEF, least_gain=1e-6), {"short": AHEAD}, 0.05
-SETS, POOL = 3, HandsOver()
+SETS, POOL, ANOTHER_ROBOT = 3, HandsOver(), "made for another robot of this name"
 
 
 @pytest.fixture(scope="module")
@@ -40,11 +40,8 @@ def robot():
 
 
 def campaign(folder, robot, plants=(None,), **others):
-    return campaigns.Campaign(
-        **{"folder": folder, "config": CONFIG, "robot": robot, "start": nominal(robot)}
-        | {"commands": COMMAND, "plants": plants}
-        | others
-    )
+    own = {"folder": folder, "config": CONFIG, "robot": robot, "start": nominal(robot)}
+    return campaigns.Campaign(**own | {"commands": COMMAND, "plants": plants} | others)
 
 
 def same(a, b):
@@ -389,10 +386,7 @@ def test_from_a_start_that_falls_in_all_cases_nothing_is_tuned_and_in_one_it_is(
     ("change", "words"),
     [
         (lambda one: {"plants": drawn_plants(one.robot, 3, first_seed=1)}, "made with plants "),
-        (
-            lambda one: {"robot": one.robot._replace(mass=np.asarray(13.0))},
-            "made for another robot of this name",
-        ),
+        (lambda one: {"robot": one.robot._replace(mass=np.asarray(13.0))}, ANOTHER_ROBOT),
         (lambda one: {"start": expert()}, "made with start "),
         (lambda one: {"commands": {"short": named_command("c")}}, "made with commands "),
         (lambda one: {"config": replace(CONFIG, ridge=0.1)}, "made with settings "),
