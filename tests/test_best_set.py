@@ -16,24 +16,22 @@ def masses(plants):
     return [float(plant.mass) for plant in plants]
 
 
-@pytest.mark.parametrize(
-    ("given", "commands", "plants", "walks"),
-    [
-        ((None, None), 1, 12, 48),  # four sets
-        ((None, None), 3, 12, 144),
-        ((2, None), 1, 2, 8),
-        ((0, None), 1, 1, 4),  # the hfs
-        ((None, 0), 1, 1, 0),
-        ((None, 2), 1, 1, 2),
-        ((None, 40), 1, 5, 40),  # eight sets
-        ((None, 36), 3, 1, 36),
-        ((None, 100_000), 1, 16, 100_000),
-        ((3, 24), 2, 3, 24),
-    ],
-)
-def test_a_budget_is_four_sets_on_twelve_plants_or_eight_on_more(given, commands, plants, walks):
-    found, budget = best_set.walk_plants(ROBOT, *given, commands)
-    assert (len(found), budget) == (plants, walks)
+# flags, commands, and the plants and walks: four sets, none beside the hfs, or eight sets
+BUDGETS = [
+    (None, None, 1, 12, 48),
+    (None, None, 3, 12, 144),
+    (2, None, 1, 2, 8),
+    (0, None, 1, 1, 4),
+]
+BUDGETS += [(None, 0, 1, 1, 0), (None, 2, 1, 1, 2), (None, 40, 1, 5, 40), (None, 36, 3, 1, 36)]
+BUDGETS += [(None, 100_000, 1, 16, 100_000), (3, 24, 2, 3, 24)]
+
+
+@pytest.mark.parametrize("budget", BUDGETS)
+def test_a_budget_is_four_sets_on_twelve_plants_or_eight_on_more(budget):
+    *given, plants, walks = budget
+    found, all_walks = best_set.walk_plants(ROBOT, *given)
+    assert (len(found), all_walks) == (plants, walks)
     if given[0] == 0:
         same = jax.tree.map(np.array_equal, found, [hfs(ROBOT.description)])
         assert jax.tree.all(same)
@@ -48,17 +46,17 @@ def test_plants_of_a_tuning_are_none_that_judge_it():
 
 
 @pytest.mark.parametrize(
-    ("given", "commands", "words"),
+    ("given", "words"),
     [
-        ((None, 1), 1, "at least 2 (1 command on 1 plant, twice), got 1"),
-        ((None, 5), 3, "at least 6 (3 commands on 1 plant, twice), got 5"),
-        ((8, 15), 1, "at least 16 (1 command on 8 plants, twice), got 15"),
-        ((0, 3), 2, "at least 4 (2 commands on 1 plant, twice), got 3"),
+        ((None, 1, 1), "at least 2 (1 command on 1 plant, twice), got 1"),
+        ((None, 5, 3), "at least 6 (3 commands on 1 plant, twice), got 5"),
+        ((8, 15, 1), "at least 16 (1 command on 8 plants, twice), got 15"),
+        ((0, 3, 2), "at least 4 (2 commands on 1 plant, twice), got 3"),
     ],
 )
-def test_a_budget_with_which_no_second_set_walks_is_one_line(given, commands, words):
+def test_a_budget_with_which_no_second_set_walks_is_one_line(given, words):
     with pytest.raises(InputError) as error:
-        best_set.walk_plants(ROBOT, *given, commands)
+        best_set.walk_plants(ROBOT, *given)
     assert str(error.value) == f"--walks must be 0 or {words}"
 
 

@@ -51,9 +51,7 @@ def evaluate(grounding, weights):
     return evaluate_jit(BRIEF, grounding, weights, PAPER_LOSS, walk=grounded_rollout)
 
 
-def test_its_gradient_is_that_of_differences_and_its_matrix_has_all_numbers_and_is_positive(
-    grounding,
-):
+def test_its_gradient_is_that_of_differences_and_its_matrix_is_whole_and_positive(grounding):
     theta = np.asarray(weights_to_vector(nominal()))
 
     def loss(logs):

@@ -24,16 +24,11 @@ from hector_jax.sim.parallel import walk_batch
 ROBOT = load_robot(EXAMPLES / "humanoid" / "robot.toml")
 CONFIG = walk_config(ROBOT)
 MU, MOST = 0.6, 800.0
+FILES = [("humanoid/robot.toml", 35.0, 0.647), ("hector-v2/robot.toml", 11.468, 0.417)]
+FILES += [("hector-v2/arms.toml", 14.848, 0.478)]
 
 
-@pytest.mark.parametrize(
-    ("file", "mass", "com_height"),
-    [
-        ("humanoid/robot.toml", 35.0, 0.647),
-        ("hector-v2/robot.toml", 11.468, 0.417),
-        ("hector-v2/arms.toml", 14.848, 0.478),
-    ],
-)
+@pytest.mark.parametrize(("file", "mass", "com_height"), FILES)
 def test_a_model_weighs_what_its_source_says_and_is_its_own_mirror_image(file, mass, com_height):
     robot = load_robot(EXAMPLES / file)
     assert robot.mass == pytest.approx(mass, abs=1e-3)

@@ -47,14 +47,10 @@ def test_every_number_has_an_upper_bound_that_is_told(monkeypatch, capsys, comma
     assert f"from {rule.low} to {rule.high}, got 1000000000000" in line
 
 
-@pytest.mark.parametrize(
-    ("make", "fault"),
-    [
-        (lambda path: None, "No such file or directory"),
-        (lambda path: os.mkfifo(path), "not a plain file"),
-    ],
-    ids=["missing", "pipe"],
-)
+UNREADABLE = [(lambda path: None, "No such file or directory"), (os.mkfifo, "not a plain file")]
+
+
+@pytest.mark.parametrize(("make", "fault"), UNREADABLE, ids=["missing", "pipe"])
 @pytest.mark.parametrize(
     ("words", "name"), [(["walk", "--weights"], "own.json"), (["log", "add", "runs"], "own.npz")]
 )
@@ -81,15 +77,11 @@ def test_what_is_no_folder_is_told_before_anything_is_made(monkeypatch, capsys, 
 def test_latest_is_the_tuning_that_began_last(monkeypatch, capsys, tmp_path):
     """Not a copy, a folder of `hector propose` or of a verdict, nor a run that was refused."""
     monkeypatch.chdir(tmp_path)
-    for name, config in (
-        ("strider/s/2", {"tune": {}, "began": "20260203-000000"}),
-        ("c/1", {"tune": {}, "began": "20260101-000000"}),
-        ("s/20260202-000000", {"tune": {}}),  # of a version that did not record it
-        ("s/20260202-000000.bak", {"tune": {}}),
-        ("strider/s/2.copy", {"tune": {}, "began": "20260203-000000"}),
-        ("refused", {"began": "20260301-000000"}),
-        ("list", []),
-    ):
+    last, old = {"tune": {}, "began": "20260203-000000"}, {"tune": {}}  # that did not record it
+    configs = {"strider/s/2": last, "c/1": {"tune": {}, "began": "20260101-000000"}}
+    configs |= {"s/20260202-000000": old, "s/20260202-000000.bak": old, "strider/s/2.copy": last}
+    configs |= {"refused": {"began": "20260301-000000"}, "list": []}
+    for name, config in configs.items():
         write_json(tmp_path / "runs" / name / "config.json", config)
         write_json(tmp_path / "runs" / name / "versions.json", {})
     write_json(tmp_path / "runs" / "robot" / "config.json", {"flags": {}})

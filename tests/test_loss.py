@@ -152,13 +152,9 @@ def test_terms_that_cannot_be_told_apart_are_refused():
 def test_a_fall_is_a_fall():
     zero = np.zeros(3)
     upright = State(zero, np.array([0.0, 0.0, 0.41]), zero, zero)
-    for fell, change in (
-        (False, {}),
-        (False, {"euler": [0.7, -0.7, 3.0]}),
-        (True, {"position": [0.0, 0.0, 0.24]}),
-        (True, {"euler": [0.0, -0.81, 0.0]}),
-        (True, {"euler": [0.81, 0.0, 0.0]}),
-        (True, {"velocity": [0.0, np.nan, 0.0]}),
-    ):
-        changed = {name: np.array(value) for name, value in change.items()}
-        assert has_fallen(upright._replace(**changed)) == fell
+    assert not has_fallen(upright)
+    assert not has_fallen(upright._replace(euler=np.array([0.7, -0.7, 3.0])))
+    assert has_fallen(upright._replace(position=np.array([0.0, 0.0, 0.24])))
+    assert has_fallen(upright._replace(euler=np.array([0.0, -0.81, 0.0])))
+    assert has_fallen(upright._replace(euler=np.array([0.81, 0.0, 0.0])))
+    assert has_fallen(upright._replace(velocity=np.array([0.0, np.nan, 0.0])))

@@ -45,13 +45,10 @@ def raised(source):
 
 def test_a_fault_of_ours_stays_what_it_is():
     own = "from hector_jax.core.inputs import InputError; raise InputError('x') from OSError()"
-    for source, kind in {
-        "from jax import nonsense": ImportError,
-        "import jax; jax.nonsense": AttributeError,
-        "import hector_jax.nonsense": ModuleNotFoundError,
-        "raise RuntimeError('x') from ImportError('y', name='jax')": RuntimeError,
-        own: InputError,
-    }.items():
+    kinds = {"from jax import nonsense": ImportError, "import jax; jax.nonsense": AttributeError}
+    kinds |= {"import hector_jax.nonsense": ModuleNotFoundError, own: InputError}
+    kinds["raise RuntimeError('x') from ImportError('y', name='jax')"] = RuntimeError
+    for source, kind in kinds.items():
         assert type(raised(source)) is kind
 
 

@@ -372,12 +372,9 @@ def test_units_redundant_rows_and_rounding_change_no_verdict():
         never = [-INF] * 3, [INF] * 3
         past, noise = ([-INF, 1e-17, -1.0], [-1e-17, INF, 1e-17]), 1e-17 * rng.normal(size=(3, 5))
         again = [qp.l[8], -2.0 * qp.u[1], -INF], [INF, -2.0 * qp.l[1], INF]
-        for more in (
-            with_rows(qp, 0.0, *never),
-            with_rows(qp, [qp.A[8], -2.0 * qp.A[1], 0.1 * qp.A[2]], *again),
-            with_rows(qp, 0.0, *past),
-            with_rows(qp, noise, *past),
-        ):
+        same = [qp.A[8], -2.0 * qp.A[1], 0.1 * qp.A[2]], *again
+        for rows_added in ((0.0, *never), same, (0.0, *past), (noise, *past)):
+            more = with_rows(qp, *rows_added)
             for size in (1.0, 1e-6, 1e-3, 1e3, 1e6):
                 one_row, one_variable = np.ones(9), np.ones(5)
                 one_row[rng.integers(9)] = one_variable[rng.integers(5)] = size

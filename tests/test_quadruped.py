@@ -33,15 +33,11 @@ CONFIG = walk_config(ROBOT)
 ANCHOR = standing_anchor(ROBOT)
 
 
-@pytest.mark.parametrize(
-    ("name", "lifts", "most"),
-    [
-        ("trot", [0.0, 0.5, 0.5, 0.0], 2),
-        ("pace", [0.5, 0.0, 0.5, 0.0], 2),
-        # each hind foot before the front foot of its side
-        ("crawl", [0.75, 0.25, 0.5, 0.0], 3),
-    ],
-)
+GAITS = [("trot", [0.0, 0.5, 0.5, 0.0], 2), ("pace", [0.5, 0.0, 0.5, 0.0], 2)]
+GAITS += [("crawl", [0.75, 0.25, 0.5, 0.0], 3)]  # each hind foot before the front foot of its side
+
+
+@pytest.mark.parametrize(("name", "lifts", "most"), GAITS)
 def test_feet_lift_in_the_order_of_the_gait(name, lifts, most):
     config = gait_named(CONFIG.gait, name)
     stands = np.asarray(gait.contact(config, jnp.arange(config.cycle)))

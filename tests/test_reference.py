@@ -36,22 +36,17 @@ def test_the_path_is_the_integral_of_its_velocity(command):
     np.testing.assert_allclose(turned, 1e-3 * middle.ang_velocity[:, 2], atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("name", "seconds", "ahead", "left", "turned"),
-    [
-        ("straight", 4.0, 2.0, 0.0, 0.0),
-        ("c", 4.0, 0.0, 2.0 / np.pi, np.pi),  # half a circle: its ends are a diameter apart
-        ("s", 2.0, 0.0, 2.0 / np.pi, np.pi),
-        ("s", 4.0, 0.0, 4.0 / np.pi, 0.0),
-        ("sideways", 4.0, 0.0, 0.8, 0.0),
-        ("turn", 4.0, 0.0, 0.0, np.pi),
-        ("eight", 2.0, 0.0, 1.2 / np.pi, np.pi),  # two circles through one point
-        ("eight", 4.0, 0.0, 0.0, 2.0 * np.pi),
-        ("eight", 8.0, 0.0, 0.0, 0.0),
-        ("stop-and-go", 1.0, 0.5, 0.0, 0.0),
-        ("stop-and-go", 4.0, 1.0, 0.0, 0.0),
-    ],
-)
+# seconds, then where the command has led: ahead, to the left, and turned; in c half a circle, whose
+# ends are a diameter apart, in eight two circles through one point
+LEADS = [("straight", 4.0, 2.0, 0.0, 0.0), ("c", 4.0, 0.0, 2.0 / np.pi, np.pi)]
+LEADS += [("s", 2.0, 0.0, 2.0 / np.pi, np.pi), ("s", 4.0, 0.0, 4.0 / np.pi, 0.0)]
+LEADS += [("sideways", 4.0, 0.0, 0.8, 0.0), ("turn", 4.0, 0.0, 0.0, np.pi)]
+LEADS += [("eight", 2.0, 0.0, 1.2 / np.pi, np.pi), ("eight", 4.0, 0.0, 0.0, 2.0 * np.pi)]
+LEADS += [("eight", 8.0, 0.0, 0.0, 0.0)]
+LEADS += [("stop-and-go", 1.0, 0.5, 0.0, 0.0), ("stop-and-go", 4.0, 1.0, 0.0, 0.0)]
+
+
+@pytest.mark.parametrize(("name", "seconds", "ahead", "left", "turned"), LEADS)
 def test_commands_lead_where_their_names_say(name, seconds, ahead, left, turned):
     level = Anchor(jnp.array([0.0, 0.0, 0.42]), jnp.array(0.0), jnp.array(0))
     state = path(named_command(name), [seconds], level)

@@ -65,17 +65,11 @@ def test_linear_algebra_has_one_thread_whatever_the_cores():
 
 
 YNN, EMITTERS = "--xla_cpu_experimental_ynn_fusion_type=", "--xla_cpu_use_fusion_emitters=false"
+BOTH = [("", "YNN EMITTERS"), ("--xla_a=1 word", "YNN EMITTERS --xla_a=1 word")]
+BOTH += [("YNNdot --xla_a=1", "EMITTERS YNNdot --xla_a=1"), ("flags.txt", "flags.txt")]
 
 
-@pytest.mark.parametrize(
-    ("before", "after"),
-    [
-        ("", "YNN EMITTERS"),
-        ("--xla_a=1 word", "YNN EMITTERS --xla_a=1 word"),
-        ("YNNdot --xla_a=1", "EMITTERS YNNdot --xla_a=1"),
-        ("flags.txt", "flags.txt"),
-    ],
-)
+@pytest.mark.parametrize(("before", "after"), BOTH)
 @pytest.mark.parametrize("version", [(0, 10, 1), (0, 10, 2), (0, 12, 0, 1), (0, 13, 0)])
 def test_flags_are_set_where_they_are_known(monkeypatch, version, before, after):
     known = {"YNN": (0, 10, 2) <= version < (0, 13), "EMITTERS": version < (0, 11)}

@@ -123,22 +123,13 @@ def after(ratio, *, radius=0.5, ridge=0.0, stiffness=1.0):
     return state, new, z
 
 
+RATIOS = [(1.0, 2.0, True), (0.61, 2.0, True), (0.59, 1.0, True), (0.26, 1.0, True)]
+RATIOS += [(0.24, 0.25, True), (0.011, 0.25, True), (0.009, 1 / 8, False), (-2.0, 1 / 8, False)]
+RATIOS += [(-np.inf, 1 / 8, False), (4.1, 2.0, True)]  # a gain beyond the prediction is no miss
+
+
 @pytest.mark.parametrize("ridge", [0.0, 0.02])
-@pytest.mark.parametrize(
-    ("ratio", "change", "accepted"),
-    [
-        (1.0, 2.0, True),
-        (0.61, 2.0, True),
-        (0.59, 1.0, True),
-        (0.26, 1.0, True),
-        (0.24, 0.25, True),
-        (0.011, 0.25, True),
-        (0.009, 1 / 8, False),
-        (-2.0, 1 / 8, False),
-        (-np.inf, 1 / 8, False),
-        (4.1, 2.0, True),  # a gain beyond the prediction is no miss
-    ],
-)
+@pytest.mark.parametrize(("ratio", "change", "accepted"), RATIOS)
 def test_the_radius_follows_the_ratio_of_the_gains(ridge, ratio, change, accepted):
     before, new, z = after(ratio, ridge=ridge)
     assert float(new.size) == pytest.approx(change * float(before.size))

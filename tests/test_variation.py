@@ -88,12 +88,8 @@ def test_a_foot_that_slips_keeps_its_direction_and_load():
 def test_drawn_variations_are_as_robots_differ():
     config = rollout_config(ROBOT).walk
     drawn = [drawn_variation(config, ROBOT, seed) for seed in range(200)]
-    for name, low, high in (
-        ("mass", 0.9, 1.1),
-        ("inertia", 0.8, 1.2),
-        ("friction", 0.48, 0.96),
-        ("delay", 0.0, 0.008),
-    ):
+    ranges = {"mass": (0.9, 1.1), "inertia": (0.8, 1.2), "friction": (0.48, 0.96)}
+    for name, (low, high) in (ranges | {"delay": (0.0, 0.008)}).items():
         values = np.array([getattr(one, name) for one in drawn])
         assert low <= values.min() < low + 0.1 * (high - low), name
         assert high - 0.1 * (high - low) < values.max() <= high, name

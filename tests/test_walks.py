@@ -393,7 +393,6 @@ def test_from_a_start_that_falls_in_all_cases_nothing_is_tuned_and_in_one_it_is(
         (lambda one: {"config": replace(CONFIG, least_gain=0.1)}, "made with settings "),
         (lambda one: {"config": replace(CONFIG, others=("turn_lead",))}, "made with "),
     ],
-    ids=["plants", "robot", "start", "commands", "ridge", "least_gain", "others"],
 )
 def test_the_record_of_another_tuning_is_refused_in_one_line(toy, change, words):
     walks.tune_on_walks(HERE, one := toy(), walks=3)

@@ -131,17 +131,12 @@ def around(share):
 
 
 MOTORS = {"delay": (0.001, 0.005), "lag": (0.002, 0.006)}
+DRAWS = [(worlds.hfs_drawn, around(0.2)), (worlds.hfs_varied, around(0.4))]
+DRAWS += [(worlds.hfs_with_motors, around(0.2) | MOTORS)]
+DRAWS += [(worlds.hfs_even, around(0.4) | MOTORS | {"mass": (0.85, 1.15)})]
 
 
-@pytest.mark.parametrize(
-    ("draw", "table"),
-    [
-        (worlds.hfs_drawn, around(0.2)),
-        (worlds.hfs_varied, around(0.4)),
-        (worlds.hfs_with_motors, around(0.2) | MOTORS),
-        (worlds.hfs_even, around(0.4) | MOTORS | {"mass": (0.85, 1.15)}),
-    ],
-)
+@pytest.mark.parametrize(("draw", "table"), DRAWS)
 def test_drawn_plants_fill_their_ranges_and_a_seed_is_a_plant(draw, table):
     plants = [draw(seed) for seed in range(100)]
     for name, (low, high) in table.items():
