@@ -65,14 +65,6 @@ def test_on_a_slope_gravity_pulls_down_it_and_so_is_the_robot():
     np.testing.assert_allclose(rest, mass * np.array([0.0, -pull[0], -pull[1]]), atol=0.5)
 
 
-def test_the_ground_pulls_no_harder_than_its_friction_of_the_moment():
-    force = short(Change(start=0.1, end=0.2, floor_friction=0.12))[0].effect.force
-    pull, load = np.hypot(force[..., 0], force[..., 1]), force[..., 2]
-    slippery = (np.arange(300) >= 100) & (np.arange(300) < 200)
-    assert np.all(pull[slippery] <= 0.12 * load[slippery] + 1e-9)
-    assert np.max(pull[~slippery] - 0.12 * load[~slippery]) > 5.0
-
-
 def test_changes_begin_and_end_at_their_milliseconds_and_add_up():
     world = build_world(ideal())
     changes = [Change(start=0.1, end=0.15, floor_friction=0.4), Change(start=0.12, payload=2.0)]
@@ -87,7 +79,12 @@ def test_changes_begin_and_end_at_their_milliseconds_and_add_up():
     assert worlds_by_step(world, (), -1100, 300) == {-1100: world}
 
 
-def test_a_payload_that_arrives_is_felt_from_then_on_and_not_before():
+def test_the_ground_pulls_no_harder_than_its_friction_and_a_payload_is_felt_from_its_arrival_on():
+    force = short(Change(start=0.1, end=0.2, floor_friction=0.12))[0].effect.force
+    pull, load = np.hypot(force[..., 0], force[..., 1]), force[..., 2]
+    slippery = (np.arange(300) >= 100) & (np.arange(300) < 200)
+    assert np.all(pull[slippery] <= 0.12 * load[slippery] + 1e-9)
+    assert np.max(pull[~slippery] - 0.12 * load[~slippery]) > 5.0
     (free, _), (loaded, gained) = short(), short(Change(start=0.1, payload=2.0))
     np.testing.assert_array_equal(loaded.state.position[:100], free.state.position[:100])
     assert free.state.position[-1, 2] - loaded.state.position[-1, 2] > 0.003

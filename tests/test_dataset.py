@@ -80,14 +80,11 @@ def test_an_interval_keeps_mean_wrenches_and_last_states():
     leaves_close(at_interval(coarse, 0.01), coarse, 0.0)
 
 
-def test_the_time_since_a_switch_counts_from_the_start_tick(three):
+def test_the_time_since_a_switch_counts_from_the_start_and_a_heading_changes_no_sample(three):
     for starts in ([0, 0, 0], [0, 10, 30]):
         data, _ = make_dataset(ROBOT, three, start_tick=starts)
         ticks = data.tick + np.array(starts)[data.walk]
         np.testing.assert_allclose(data.window.since_switch, 0.01 * (ticks % 20))
-
-
-def test_a_walk_on_another_heading_makes_the_same_samples():
     walk = synthetic_walk(5, TICKS)
     here, _ = make_dataset(ROBOT, walks_of(walk))
     there, _ = make_dataset(ROBOT, walks_of(elsewhere(walk, (0.0, 0.0), 2.1)))

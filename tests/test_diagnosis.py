@@ -72,7 +72,7 @@ def test_the_likeliest_cause_follows_from_what_came_before_the_fall(record, caus
     assert likeliest_cause(ROBOT, record).startswith(cause)
 
 
-def test_a_fall_in_the_start_up_is_that_of_the_walk():
+def test_a_fall_in_the_start_up_or_later_is_that_of_the_walk_with_the_cause_of_its_plant():
     heavy = JOB._replace(imperfections=hfs()._replace(mass=np.array(6.0)), seconds=0.05)
     walked, fall = walk(CONFIG, ROBOT, heavy), fall_of(CONFIG, ROBOT, heavy)
     assert walked.fallen.all()
@@ -81,9 +81,6 @@ def test_a_fall_in_the_start_up_is_that_of_the_walk():
     assert fall.height < ROBOT.description.min_height
     assert "sinks steadily" in fall.cause
     assert fall_of(CONFIG, ROBOT, JOB._replace(seconds=0.05)) is None
-
-
-def test_a_fall_of_a_walk_has_the_cause_of_its_plant():
     icy = hfs()._replace(floor_friction=np.array(0.22))
     job = JOB._replace(command=named_command("s"), imperfections=icy, seconds=2.0)
     fall = fall_of(CONFIG, ROBOT, job)

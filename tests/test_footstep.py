@@ -42,7 +42,7 @@ def test_a_robot_that_stands_still_puts_its_feet_under_its_hips(yaw):
     np.testing.assert_allclose(heading, yaw)
 
 
-def test_a_foot_lands_half_a_stance_ahead_and_further_by_the_feedback_if_too_fast():
+def test_a_foot_lands_half_a_stance_ahead_further_if_too_fast_and_sways_one_swing_at_most():
     now = state(velocity=(0.5, 0.2, 0.0))
     points, _ = feet(now, now)
     ahead = 0.5 * (WAIT + STANCE / 2)
@@ -51,9 +51,6 @@ def test_a_foot_lands_half_a_stance_ahead_and_further_by_the_feedback_if_too_fas
     wanted, more = state(velocity=(0.3, 0.2, 0.0)), FootstepConfig(feedback=0.2)
     further = feet(now, wanted, more)[0] - feet(now, wanted)[0]
     np.testing.assert_allclose(further, [[0.08 * 0.2, 0.0, 0.0]] * 2, atol=1e-12)
-
-
-def test_the_sway_of_this_moment_carries_one_swing_at_most():
     swaying = state(velocity=(0.0, 0.3, 0.0))
     waits = (0.39, 0.21, 0.15, 0.05)
     left = [feet(swaying, state(), wait=jnp.array([wait, 0.1]))[0][0, 1] for wait in waits]

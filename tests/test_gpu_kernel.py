@@ -44,13 +44,10 @@ def test_the_kernel_knows_a_definite_matrix(least, definite):
     assert gpu_kernel.guess(*qp, curvature=1e-8, interpret=True).definite == definite
 
 
-def test_only_small_problems_fit():
+def test_only_small_problems_fit_and_the_package_loads_without_triton():
     assert gpu_kernel.fits(50, 110)
     assert gpu_kernel.fits(gpu_kernel.VARIABLES, gpu_kernel.ROWS)
     assert not gpu_kernel.fits(100, 110)
     assert not gpu_kernel.fits(50, 220)
-
-
-def test_the_package_loads_without_triton():
     absent = "import sys; sys.modules['jaxlib.mlir._mlir_libs._triton_ext'] = None"
     subprocess.run([sys.executable, "-c", f"{absent}; import hector_jax.tuning.batch"], check=True)

@@ -40,18 +40,17 @@ def grounding(measured):
     return fit_grounding(BRIEF, SCENARIO, nominal(), measured)
 
 
-def test_with_the_weights_that_were_walked_a_grounded_rollout_is_the_walk(grounding, measured):
-    again = jax.jit(grounded_rollout, static_argnums=0)(BRIEF, grounding, nominal())
-    for found, there in zip(again.state, measured.state, strict=True):
-        np.testing.assert_allclose(found, there[1:], atol=1e-12)
-    assert not again.fallen.any()
-
-
 def evaluate(grounding, weights):
     return evaluate_jit(BRIEF, grounding, weights, PAPER_LOSS, walk=grounded_rollout)
 
 
-def test_its_gradient_is_that_of_differences_and_its_matrix_is_whole_and_positive(grounding):
+def test_a_grounded_rollout_is_its_walk_with_the_slope_of_differences_and_a_matrix(
+    grounding, measured
+):
+    again = jax.jit(grounded_rollout, static_argnums=0)(BRIEF, grounding, nominal())
+    for found, there in zip(again.state, measured.state, strict=True):
+        np.testing.assert_allclose(found, there[1:], atol=1e-12)
+    assert not again.fallen.any()
     theta = np.asarray(weights_to_vector(nominal()))
 
     def loss(logs):

@@ -146,7 +146,7 @@ def test_swing_joints_put_the_feet_on_the_path_and_an_overdue_foot_waits_at_its_
     np.testing.assert_allclose(np.arctan2(R[:, 1, 0], R[:, 0, 0]), turned, atol=0.02)
 
 
-def test_swing_rates_are_the_derivative_of_the_angles_under_a_moving_trunk():
+def test_swing_rates_are_those_of_the_angles_and_half_a_turn_is_crossed_the_short_way():
     state, step = base((0.0, 0.05, 0.1), (0.4, 0.1, 0.02)), 1e-5
 
     def at(time):
@@ -156,9 +156,6 @@ def test_swing_rates_are_the_derivative_of_the_angles_under_a_moving_trunk():
     _, rates = swing([0.08] * 2, state)
     np.testing.assert_allclose(rates, (at(step) - at(-step)) / (2 * step), atol=1e-6)
     assert np.abs(rates).max() > 1.0
-
-
-def test_a_swing_across_half_a_turn_takes_the_short_way():
     state = base((0.0, 0.0, np.pi))
     start_yaw, end_yaw = jnp.full(2, np.pi - 0.1), jnp.full(2, -np.pi + 0.1)
     turned = START * jnp.array([-1.0, -1.0, 1.0])

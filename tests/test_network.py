@@ -81,7 +81,7 @@ def test_a_drawn_model_has_one_member_and_their_mean_is_the_ensemble(params, ens
         jax.tree.map(np.testing.assert_array_equal, effect, as_effect(params))
 
 
-def test_the_derivative_in_64_bits_agrees_with_differences_and_both_modes(either, window):
+def test_the_derivative_is_that_of_differences_in_both_modes_and_finite_in_silence(either, window):
     effect = as_effect(either)
     force, moment = np.random.default_rng(2).normal(size=(2, HISTORY, 2, 3))
     along = Wrench(force, 0.1 * moment)
@@ -102,9 +102,6 @@ def test_the_derivative_in_64_bits_agrees_with_differences_and_both_modes(either
     assert np.isfinite(forward)
     np.testing.assert_allclose(forward, differences, rtol=1e-6)
     np.testing.assert_allclose(forward, reverse, rtol=1e-12)
-
-
-def test_the_gradient_is_finite_where_nothing_is_commanded(either, window):
     silent = window._replace(commands=jax.tree.map(jnp.zeros_like, window.commands))
     total = jax.jit(jax.grad(lambda w: as_effect(either)(w).wrench.force.sum(), allow_int=True))
     assert all(np.isfinite(g).all() for g in total(silent).commands)

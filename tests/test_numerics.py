@@ -60,8 +60,7 @@ def another(option):
     return "/tmp/other" if kind is str else str((value or 0) + 1)
 
 
-def test_no_option_that_is_ours_can_be_set_from_outside(usual):
-    """Whichever this JAX has: all of them at once."""
+def test_options_of_devices_and_logs_are_the_users_and_no_other_can_be_set_from_outside(usual):
     options = [name for name in jax.config.values if not name.startswith(numerics._FREE)]
     words = {"jax_default_device": "cpu", "jax_pjrt_client_create_options": ""}
     variables = {name.upper(): words.get(name) or another(name) for name in options}
@@ -70,9 +69,6 @@ def test_no_option_that_is_ours_can_be_set_from_outside(usual):
     assert not_used == variables
     assert {n: (after[n], usual[2][n]) for n in after if after[n] != usual[2][n]} == {}
     assert numbers == usual[0]
-
-
-def test_options_of_devices_and_logs_are_the_users(usual):
     free = {"JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": "3", "JAX_LOG_COMPILES": "0"}
     numbers, not_used, options = computed(**free)
     assert (numbers, not_used) == (usual[0], {})

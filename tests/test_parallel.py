@@ -19,7 +19,7 @@ CONFIG = WalkConfig()
 UNUSED = ("cam_", "light_", "actuator_acc0")  # by MJX, in a robot without muscles
 
 
-def test_only_what_differs_between_plants_is_batched():
+def test_only_what_differs_is_batched_and_contacts_are_of_feet_and_between_legs_alone():
     worlds = build_worlds([hfs_drawn(seed) for seed in range(3)])
     shared, varied = batched_model(worlds)
     for name in shared.__dataclass_fields__:
@@ -30,9 +30,6 @@ def test_only_what_differs_between_plants_is_batched():
             else:
                 np.testing.assert_array_equal(values[0], values[1], err_msg=name)
     assert shared.nq == worlds[0].model.nq
-
-
-def test_mjx_looks_for_contacts_of_the_feet_and_between_the_legs_alone():
     world = build_world(hfs())
     model, _ = batched_model([world])
     found = jax.jit(lambda data: mjx.collision(model, mjx.kinematics(model, data)))

@@ -466,7 +466,7 @@ def test_a_batch_is_a_loop_whatever_becomes_of_its_problems(walking):
     assert [Status(code).name for code in np.asarray(batch.status)] == expected
 
 
-def test_a_solver_is_a_value_and_one_of_ones_own_is_another(walking, walked):
+def test_a_solver_is_a_value_jaxopt_is_one_and_one_of_ones_own_another(walking, walked):
     read = from_table("file", QpConfig, {"solver": "jaxopt"})
     assert (read, hash(read)) == (QpConfig(JAXOPT), hash(QpConfig(JAXOPT)))
     assert to_table(read)["solver"] == "jaxopt"
@@ -480,9 +480,6 @@ def test_a_solver_is_a_value_and_one_of_ones_own_is_another(walking, walked):
     found = [solve(qp, cold) for qp in walking[:4]]
     assert set(called) == {59}
     np.testing.assert_allclose(stack(found).x, walked.x[:4], atol=1e-6)
-
-
-def test_jaxopt_is_a_second_solver_behind_the_door(walking):
     for qp in walking[:4]:
         tangent = only(qp, q=np.ones(50))
         ours, mine = along(qp, tangent)
@@ -624,8 +621,7 @@ def test_derivative_is_finite_where_it_is_one_sided():
     assert np.isfinite(moved).all()
 
 
-def test_data_that_is_not_finite_is_told_and_moves_nothing():
-    @jax.jit
+def test_data_that_is_not_finite_is_told_and_moves_nothing_and_residuals_have_no_slope():
     def pull(qp):
         return jax.grad(lambda qp: jnp.sum((found := solve_qp(qp)).x + found.y[0]))(qp)
 
@@ -637,12 +633,8 @@ def test_data_that_is_not_finite_is_told_and_moves_nothing():
             assert along(qp, good)[0].status == Status.BAD_DATA
             assert not np.any(np.concatenate([along(qp, good)[1], *map(np.ravel, pull(qp))]))
 
-
-def test_residuals_have_no_slope():
-    """They are evidence; a loss that holds them is not pulled by their rounding."""
-
     @jax.jit
-    def slopes(qp):
+    def slopes(qp):  # of evidence: a loss that holds it is not pulled by its rounding
         moved = jax.jvp(solve_qp, (qp,), (qp,))[1]
         return moved.primal_residual, moved.dual_residual, moved.gap
 

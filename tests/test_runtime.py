@@ -17,13 +17,6 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.numerics import add_flags, without_our_flags
 
 
-def test_importing_the_library_computes_nothing():
-    told = "import hector_jax.tuning.difftune; from jax._src import xla_bridge"
-    told += "; assert not xla_bridge.backends_are_initialized()"
-    root = Path(runtime.__file__).parents[2]
-    subprocess.run([sys.executable, "-c", told], cwd=root, check=True)
-
-
 def test_a_worker_computes_in_64_bits_and_draws_what_its_parent_draws(monkeypatch):
     monkeypatch.setenv("JAX_RANDOM_SEED_OFFSET", "1")
     monkeypatch.setenv("JAX_DEFAULT_PRNG_IMPL", "rbg")
@@ -60,7 +53,11 @@ def test_without_semaphores_one_process_computes_and_several_are_refused(monkeyp
             pass
 
 
-def test_linear_algebra_has_one_thread_whatever_the_cores():
+def test_importing_the_library_computes_nothing_and_linear_algebra_has_one_thread():
+    told = "import hector_jax.tuning.difftune; from jax._src import xla_bridge"
+    told += "; assert not xla_bridge.backends_are_initialized()"
+    root = Path(runtime.__file__).parents[2]
+    subprocess.run([sys.executable, "-c", told], cwd=root, check=True)
     assert {x["num_threads"] for x in threadpool_info() if x["user_api"] == "blas"} <= {1}
 
 

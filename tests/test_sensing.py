@@ -138,7 +138,7 @@ def test_what_touches_is_told_and_only_feet_on_the_floor_push(height, inwards, f
     assert floor or not (np.any(wrench.force) or np.any(wrench.moment))
 
 
-def test_errors_have_their_stated_sizes_and_a_known_state_has_none():
+def test_the_controller_is_told_the_truth_plus_errors_of_their_stated_sizes():
     assert not sensing.draw_errors(truth(), 10, 0, 10, 20).any()
     estimator = standin(0).estimator
     runs = np.stack([sensing.draw_errors(estimator, 10, seed, 100, 4000) for seed in range(60)])
@@ -148,9 +148,6 @@ def test_errors_have_their_stated_sizes_and_a_known_state_has_none():
     end = runs[:, -100:].mean(axis=1)  # the noise averages out, the drift stays
     np.testing.assert_allclose(end[:, [2, 3, 4]].std(axis=0), 0.01, rtol=0.3)
     assert np.abs(end[:, [0, 1, 5]]).max() < 0.003
-
-
-def test_the_controller_is_told_the_truth_plus_the_error():
     reading = jnp.asarray(stand(ideal(), steps=0)[2])
     true, _ = sensing.measure(ROBOT, reading, jnp.zeros(()), sensing.no_error(ROBOT))
     error = jnp.linspace(0.01, 0.22, 22)

@@ -150,7 +150,7 @@ def test_the_limit_of_a_motor_is_the_smallest_that_the_file_states(tmp_path):
     np.testing.assert_array_equal(model.actuator_ctrlrange[:, 1], [20, 20, 15, 20] * 2)
 
 
-def test_soles_stand_on_the_floor_with_their_spheres_alone(tmp_path):
+def test_soles_of_two_or_four_contacts_stand_on_the_floor_with_their_spheres_alone(tmp_path):
     description = small(tmp_path)
     model = build_spec(description).spec.compile()
     data, spheres = standing(model), set(contacts_of(description))
@@ -167,9 +167,6 @@ def test_soles_stand_on_the_floor_with_their_spheres_alone(tmp_path):
     assert model.geom_friction[colliding, 0].max() <= 0.2
     kinds = {mujoco.mjtGeom(int(kind)).name for kind in model.geom_type[colliding]}
     assert kinds == {"mjGEOM_SPHERE", "mjGEOM_BOX", "mjGEOM_CAPSULE"}
-
-
-def test_a_sole_may_have_four_contacts(tmp_path):
     corners = tuple((x, y, -0.04) for x in (0.07, -0.05) for y in (0.03, -0.03))
     flat = small(tmp_path, contacts=corners)
     names = [f"{side}_contact_{i}" for side in ("left", "right") for i in range(4)]

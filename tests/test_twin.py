@@ -44,7 +44,7 @@ def twin(**changes):
     return WalkConfig(twin=TwinConfig(**changes))
 
 
-def test_a_reference_from_the_robot_starts_at_it_and_goes_on_with_the_command():
+def test_a_reference_from_the_robot_starts_at_it_and_keeps_to_the_path_where_nothing_moves():
     motion = ReferenceInputs(named_command("c"), ANCHOR, jnp.arange(0, 33, 3), STATE)
     ahead = FROM_ROBOT.of(0.01, motion)
     np.testing.assert_allclose(ahead.position[0], [1.0, 2.0, HEIGHT], atol=1e-15)
@@ -56,9 +56,6 @@ def test_a_reference_from_the_robot_starts_at_it_and_goes_on_with_the_command():
     path = PATH.of(0.01, motion)
     np.testing.assert_allclose(path.ang_velocity, ahead.ang_velocity)
     np.testing.assert_allclose(path.position[0], [*ROBOT.com_offset[:2], HEIGHT], atol=1e-12)
-
-
-def test_what_the_command_leaves_at_rest_keeps_to_the_path():
     path, robot, both = (
         horizon(twin(**changes)).reference
         for changes in ({}, {"reference": FROM_ROBOT}, {"reference": FROM_ROBOT, "at_rest": 0.2})

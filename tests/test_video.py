@@ -18,7 +18,7 @@ from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film, w
 from hector_jax.robot.description import MODEL_PATH
 
 
-def test_a_drawn_pose_has_the_walked_centre_of_mass_and_attitude():
+def test_a_film_shows_the_pose_of_its_time_as_it_was_walked_and_after_a_fall_the_last_one():
     euler, position = np.array([[0.1, -0.2, 2.5]]), np.array([[0.3, -0.4, 0.5]])
     state = State(euler, position, np.zeros((1, 3)), np.zeros((1, 3)))
     model = mujoco.MjModel.from_xml_path(str(MODEL_PATH))
@@ -28,9 +28,6 @@ def test_a_drawn_pose_has_the_walked_centre_of_mass_and_attitude():
     np.testing.assert_allclose(data.subtree_com[1], position[0], atol=1e-9)
     expected = Rotation.from_euler("ZYX", euler[0, ::-1]).as_matrix()
     np.testing.assert_allclose(data.xmat[1].reshape(3, 3), expected, atol=1e-9)
-
-
-def test_a_film_shows_the_state_of_its_time_and_after_a_fall_the_last_one():
     slow, fast = (pretend_walk(seconds=1.0, period=p, fall_at=0.5) for p in (0.01, 0.001))
     one, other = motions(ROBOT, {"a": slow, "b": fast}).values()
     times = 0.04 * np.arange(26)
