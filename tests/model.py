@@ -53,7 +53,6 @@ def small_net(seed=0):
 
 
 def small_effect(seed=0):
-    """Phi of `small_net`."""
     return as_effect(small_net(seed))
 
 
@@ -69,5 +68,4 @@ def random_weights(seed, about=expert, factor=3.0):
 
 
 def mean_of(objectives, losses=None):
-    """The mean of objectives, see `mean_objective`."""
     return mean_objective(lambda weights: [one.slope(weights) for one in objectives], losses)

@@ -48,7 +48,6 @@ def files(folder):
 
 
 def call(monkeypatch, *words):
-    """Run a line of the console script in this process; its exit code."""
     monkeypatch.setattr(sys, "argv", ["hector", *map(str, words)])
     return main()
 

@@ -38,7 +38,6 @@ def test_help_opens_with_what_is_typed_first_and_names_each_command_once():
 
 
 def helped(monkeypatch, capsys, *words):
-    """What is printed by a line that asks for help."""
     with pytest.raises(SystemExit) as left:
         call(monkeypatch, *words)
     assert left.value.code == 0
@@ -172,7 +171,6 @@ REFUSED = [  # the whole of what is said, or a part of it
 
 @pytest.fixture(scope="module")
 def named(tmp_path_factory):
-    """A folder with what the refused lines name."""
     folder = tmp_path_factory.mktemp("named")
     for name, text in FILES.items():
         (folder / name).parent.mkdir(exist_ok=True)
@@ -317,8 +315,7 @@ def test_the_doctor_reports_what_works_and_what_does_not(monkeypatch, capsys):
     instead(monkeypatch, doctor, "write_film", lambda *args: "egl")
     assert call(monkeypatch, "doctor", "--json") == 0
     told = json.loads(capsys.readouterr().out)
-    assert told.pop("faults") == []
-    assert told["precision"] == "float64"
+    assert (told.pop("faults"), told["precision"]) == ([], "float64")
     assert told["robot"].startswith(str(MODEL_PATH))
     assert {"python", "jax", "mujoco", "devices", "cache", "extras", "video"} <= told.keys()
     assert "view: yes (for hector view)" in told["extras"]

@@ -41,7 +41,6 @@ def commanded(decided, memory, substep, measurement):
 
 
 def standing(x=0.0):
-    """A robot in the standing pose somewhere."""
     zero = jnp.zeros(3)
     state = State(zero, jnp.array([x, 0.0, HEIGHT]), zero, zero)
     return Measurement(state, jnp.asarray(ROBOT.standing_joints), jnp.zeros(10))
@@ -142,8 +141,7 @@ def test_the_stance_foot_carries_the_robot_and_the_other_nothing(tick, foot, swu
     assert decided.status == Status.SOLVED
     assert decided.residual < 1e-8
     assert bool(decided.contact[foot])
-    assert decided.swing_ticks[foot] == 0
-    assert decided.swing_ticks[1 - foot] == swung
+    assert (decided.swing_ticks[foot], decided.swing_ticks[1 - foot]) == (0, swung)
     assert 0.5 * WEIGHT < decided.wrench.force[foot, 2] < 2 * WEIGHT
     assert not np.asarray(decided.wrench.force[1 - foot]).any()
     assert not np.asarray(decided.wrench.moment[1 - foot]).any()

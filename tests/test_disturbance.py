@@ -32,8 +32,7 @@ def test_a_robot_too_low_lacks_force_in_its_yaw_frame_and_a_push_counts_less_tha
     there = AT_REST._replace(euler=heading, position=np.array([0.0, -0.01, -0.02]))
     wanted = AT_REST._replace(euler=heading)
     found = integrate(INTEGRAL, NO_DISTURBANCE, there, wanted, 0.01)
-    assert found.linear[0] < 0
-    assert found.linear[2] < 0
+    assert max(found.linear[0], found.linear[2]) < 0
     np.testing.assert_allclose(found.linear[1], 0.0, atol=1e-15)
     np.testing.assert_allclose(found.angular, 0.0, atol=1e-15)
 

@@ -43,7 +43,6 @@ READ = [README, ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md", *PAGES]
 
 
 def blocks(text, language=""):
-    """Fenced blocks of a page."""
     fenced = re.findall(r"^```(.*)\n((?:.*\n)*?)```$", text, re.MULTILINE)
     return [block for kind, block in fenced if kind == language]
 
@@ -307,7 +306,6 @@ def interval(change, sign=""):
 
 
 def tracking():
-    """Errors in walks."""
     assert sum(one["falls"] for t in COMMANDS for one in sets(t).values()) == 0
     (count,) = {len(one["seeds"]) for t in COMMANDS for one in sets(t).values()}
     assert [float(named_command(t).velocity[0, 0]) for t in COMMANDS] == [0.5, 0.25, 0.5]
@@ -330,7 +328,6 @@ def tracking():
 
 
 def losses():
-    """Changes of the loss, of weights and of the numbers beside them."""
     for name, base in itertools.product(("without", "with", "best"), ("nominal", "expert")):
         changes = [sets(t)[name]["change"][base] for t in COMMANDS]
         assert all(change["counts"] for change in changes)
@@ -350,7 +347,6 @@ def losses():
 
 
 def changes_of_the_command():
-    """Smoothness, and legs that touch."""
     for name in ("nominal", "without", "with", "best"):
         cells = [f"{x:.1f} times, {y:{'+' * bool(y)}} %" for x, y in smoothness(name)]
         yield RESULTS, row(f"`{name}`", *cells)
@@ -375,7 +371,6 @@ DISTURBANCES = {
 
 
 def disturbances():
-    """Falls under disturbances."""
     result = report("robustness/robustness.json")
     assert result["weights"]["best"] == tree_hash(best())
     assert result["totals"]["best"]["falls_more"] == []
@@ -383,7 +378,6 @@ def disturbances():
     yield RESULTS, f"Of {len(result['cells'])} kinds of scenes"
 
     def count(pattern):
-        """Walks, and falls of nominal and of best."""
         chosen = [one for name, one in scenes.items() if re.fullmatch(pattern, name)]
         falls = [sum(one[name]["falls"] for one in chosen) for name in ("nominal", "best")]
         return sum(one["best"]["walks"] for one in chosen), *falls
@@ -403,7 +397,6 @@ def disturbances():
 
 
 def race():
-    """Few walks, and other methods."""
     methods = report("race/nominal/race.json")["s"].items()
     median = lambda own: {walks: np.median(losses) / 1e6 for walks, losses in own.items()}  # noqa: E731
     at = {name: median(one["own"]) for name, one in methods}
@@ -433,7 +426,6 @@ NAMES = ("best", "nominal")
 
 
 def robots():
-    """Other robots, each tuned for all three trajectories."""
     results = report("robots/robots.json")
 
     def walked(runs):
@@ -469,7 +461,6 @@ def robots():
 
 
 def published_robots():
-    """Robots tuned for straight alone."""
     told, fell, changes_on_straight = [], set(), {}
     all_numbers = report("robots/robots.json")["all numbers"]
     for robot, name in PUBLISHED.items():
@@ -505,7 +496,6 @@ def published_robots():
 
 
 def engines():
-    """The verdict in other engines."""
     result = report("verdict/verdict.json")
     assert result["config"]["flags"]["engine"] == ["c", "drake", "pinocchio"]
     of, falls = result["sets"]["best"], {n: one["falls"] for n, one in result["sets"].items()}

@@ -30,7 +30,6 @@ def job(imperfections, seconds=1.0, weights=None, **others):
 
 @cache
 def walked(build, plant):
-    """A second of walking in the plant of this name."""
     return walk(CONFIG, HECTOR, job(WORLDS[plant]()), build=build)
 
 

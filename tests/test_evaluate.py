@@ -41,8 +41,7 @@ def test_cells_below_and_clear_and_void_are_counted():
 
 def test_plants_are_the_sample_of_falls_over_engines_and_trajectories_and_intervals_are_exact():
     none, one = matrix.fall_share(0, 32), matrix.fall_share(1, 8)
-    assert none.low == 0.0
-    assert none.high == pytest.approx(1.0 - 0.025 ** (1 / 32))
+    assert (none.low, none.high) == (0.0, pytest.approx(1.0 - 0.025 ** (1 / 32)))
     # P(X >= 1 | low) = P(X <= 1 | high) = 2.5 %
     assert 1.0 - (1.0 - one.low) ** 8 == pytest.approx(0.025)
     assert (1 - one.high) ** 8 + 8 * one.high * (1 - one.high) ** 7 == pytest.approx(0.025)

@@ -23,7 +23,6 @@ TABLE = FILE.read_text()
 
 
 def changed(folder, *changes):
-    """The model with some of its text replaced."""
     path = folder / "quadruped.xml"
     path.write_text(replaced(MODEL.read_text(), *changes))
     return path
@@ -31,8 +30,7 @@ def changed(folder, *changes):
 
 def test_the_example_is_what_is_proposed_for_its_model():
     proposal = propose_robot(MODEL)
-    assert proposal.wrong == ()
-    assert proposal.table == tomllib.loads(TABLE)
+    assert (proposal.wrong, proposal.table) == ((), tomllib.loads(TABLE))
     assert proposal.survey.forwards == (False, False)
 
 
@@ -119,8 +117,7 @@ def test_hind_knees_that_bend_the_other_way_are_told_and_stand(tmp_path, monkeyp
     knees = (r'(?=<joint name="hind_\w+_knee")<joint', '<joint range="0.83776 2.7227"')
     path = changed(tmp_path, knees, ("-0.5236 4.5379", "-4.5379 0.5236"))
     proposal = propose_robot(path)
-    assert proposal.wrong == ()
-    assert proposal.survey.forwards == (False, True)
+    assert (proposal.wrong, proposal.survey.forwards) == ((), (False, True))
     angles = proposal.table["standing"]
     for joint in ("pitch", "knee"):
         front, hind = (angles[f"{pair}_left_{joint}"] for pair in ("front", "hind"))

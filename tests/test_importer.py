@@ -29,7 +29,6 @@ HUMANOID, QUADRUPED = (EXAMPLES / x / f"{x}.xml" for x in ("humanoid", "quadrupe
 
 
 def edited(folder, *changes, **parts):
-    """The small biped with some of its text replaced."""
     path = small(folder, **parts).model
     path.write_text(replaced(path.read_text(), *changes))
     return path

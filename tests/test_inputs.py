@@ -97,7 +97,6 @@ def test_settings_are_refused_by_field_and_value():
 
 
 def edited(part, entry, value):
-    """The text of a file of weights with another entry."""
     tree = {"Q": {}, "R": {"force": [[1e-4] * 3] * 2, "moment": [[1e-4] * 3] * 2}, "others": {}}
     tree["Q"] |= {n: [1.0, 2.0, 3.0] for n in ("euler", "position", "ang_velocity", "velocity")}
     tree[part][entry] = value

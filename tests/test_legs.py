@@ -49,7 +49,6 @@ def base(euler=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0)):
 
 @jax.jit
 def world_feet(state, joints):
-    """Foot points and foot axes in the world."""
     R_wb, local = rotation_from_euler(state.euler), poses(joints)
     return legs.trunk_position(ROBOT, state) + local.position @ R_wb.T, R_wb @ local.rotation
 

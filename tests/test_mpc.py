@@ -106,7 +106,6 @@ def rolled_out(state, horizon, u):
 
 
 def cost(weights, state, horizon, u):
-    """Eq. 3 of the states that are rolled out."""
     Q, R = np.concatenate(weights.Q), np.asarray(pack_wrench(weights.R))
     wanted = np.concatenate(horizon.reference, axis=1)
     states = rolled_out(state, horizon, u)[:, :12]

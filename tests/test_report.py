@@ -25,7 +25,6 @@ def printed(verdict, **options):
 
 
 def written(folder, verdict=None, **others):
-    """The text of report.md."""
     history = pretend_history(14, refused=(3, 12))
     history[12] = history[12]._replace(status=np.array(StepStatus.UNSOLVED))
     direction = Direction(0.25, 0.96, {"Q_pitch": 0.9, "Q_x": -0.4})

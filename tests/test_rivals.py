@@ -61,8 +61,7 @@ def test_a_search_over_plants_that_was_cut_ends_as_if_it_had_not_been(monkeypatc
     path.write_bytes(b"".join(lines[:9]) + lines[9][:50])
     walked.clear()
     np.testing.assert_array_equal(search(flags).Q.euler, whole.Q.euler)
-    assert walked == [1, *[8] * 4]
-    assert path.read_bytes() == b"".join(lines)
+    assert (walked, path.read_bytes()) == ([1, *[8] * 4], b"".join(lines))
     path.write_bytes(b"".join([*lines[:2], b'{"steps": [[0]], "losses": [1]}\n']))
     for other, told in ((flags, "line 3"), (replace(flags, seed=5), "made with seed 0")):
         walked.clear()  # the record knows its functions with all that they hold

@@ -15,7 +15,6 @@ MODEL = compile_model(describe())
 
 
 def body_pairs(model, data):
-    """Pairs of body names in contact."""
     bodies = model.geom_bodyid[data.contact.geom]
     return [tuple(model.body(b).name for b in pair) for pair in bodies]
 

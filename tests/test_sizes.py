@@ -25,7 +25,6 @@ def described(folder, text):
 
 
 def exactly(plant):
-    """Each number to the last bit."""
     flat = plant._asdict() | {f"estimator.{k}": v for k, v in plant.estimator._asdict().items()}
     del flat["estimator"]
     return {name: [float(x).hex() for x in np.ravel(value)] for name, value in flat.items()}

@@ -52,8 +52,7 @@ def test_films_and_strips_are_written_with_the_promised_size(tmp_path):
         pytest.skip(str(error))
     frames = imageio_ffmpeg.read_frames(tmp_path / "film.mp4")
     about = next(frames)
-    assert about["size"] == (640, 432)
-    assert about["fps"] == 10
+    assert (about["size"], about["fps"]) == ((640, 432), 10)
     pictures = [np.frombuffer(f, np.uint8).reshape(432, 640, 3).astype(int) for f in frames]
     assert len(pictures) == 3
     assert np.ptp(pictures[0][60:300]) > 150

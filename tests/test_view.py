@@ -30,7 +30,6 @@ from hector_jax.store.cache import robot_hash
 
 
 def viewed(seed=0, **kwargs):
-    """A pretended walk."""
     walk = pretend_walk(seed, **kwargs)
     return ViewedWalk(walk, {"commanded": walk.command, "measured": walk.effect})
 
@@ -174,7 +173,6 @@ def test_only_the_net_of_the_run_predicts(monkeypatch, capsys, tmp_path, own):
 
 
 def until(seconds, seen):
-    """Ask again until it is seen."""
     end = time.monotonic() + seconds
     while not seen():
         assert time.monotonic() < end, f"not seen within {seconds} s"

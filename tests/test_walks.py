@@ -45,7 +45,6 @@ def campaign(folder, robot, plants=(None,), **others):
 
 
 def same(a, b):
-    """Whether two trees are equal to the last bit."""
     return jax.tree.all(jax.tree.map(np.array_equal, a, b))
 
 
@@ -145,7 +144,6 @@ def as_weights(vector):
 
 
 def toy_case(campaign, weights, case):
-    """A walk of the toy."""
     WALKED.append((case, weights))
     return walk_log.ScoredLog(toy_loss(weights, case), LOG)
 

@@ -120,7 +120,6 @@ def test_a_motor_lags_is_weaker_than_told_saturates_and_its_linkage_leaks_into_t
 
 
 def around(share):
-    """Ranges of the plants about the hfs."""
     names = ("joint_friction", "joint_damping", "backlash", "delay", "lag", "linkage")
     base = {name: float(getattr(hfs(), name)) for name in names}
     table = {name: (value * (1 - share), value * (1 + share)) for name, value in base.items()}
