@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from model import HEIGHT, ROBOT, WEIGHT
 
-from hector_jax import State, WalkConfig, named_command
-from hector_jax.control import Anchor, GaitConfig, actuate, controller, expert, init_memory
-from hector_jax.control.controller import plan, step_plan
+from hector_jax import State, WalkConfig, expert, named_command
+from hector_jax.control import Anchor, GaitConfig, actuate, controller, init_memory, plan, step_plan
 from hector_jax.control.legs import Measurement, stance_torques
 from hector_jax.control.mpc import Horizon, MpcConfig
 from hector_jax.control.parameters import TUNABLES, Q

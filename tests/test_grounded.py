@@ -6,10 +6,9 @@ import pytest
 from model import AHEAD, ANCHOR, BRIEF, PLAIN, ROBOT
 from pretend import elsewhere, still_walk
 
-from hector_jax import PAPER_LOSS, Job, Scenario, hfs, named_command, walk
+from hector_jax import PAPER_LOSS, Job, Scenario, State, Wrench, hfs, named_command, walk
 from hector_jax.control.weights import nominal, vector_to_weights, weights_to_vector
 from hector_jax.control.weights_file import best
-from hector_jax.core.trajectory import State, Wrench
 from hector_jax.tuning.curvature import least_squares_jit
 from hector_jax.tuning.evaluate import evaluate_jit
 from hector_jax.tuning.grounded import fit_grounding, grounded_rollout

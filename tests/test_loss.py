@@ -13,19 +13,13 @@ from hector_jax import PAPER_LOSS, InputError, LossTerm, last_command, named_com
 from hector_jax.core.trajectory import State, Wrench, has_fallen
 from hector_jax.report.report import render
 from hector_jax.store.folder import as_row
+from hector_jax.tuning import loss as loss_terms
 from hector_jax.tuning.difftune import TuneConfig, tune
-from hector_jax.tuning.loss import (
-    changes_between,
-    loss_of_robot,
-    losses,
-    residuals,
-    switch_loss,
-    total,
-)
+from hector_jax.tuning.loss import changes_between, losses, residuals, total
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.verdict import metrics
 
-parts_of, switches_of = jax.jit(partial(losses, PAPER_LOSS)), jax.jit(switch_loss)
+parts_of, switches_of = jax.jit(partial(losses, PAPER_LOSS)), jax.jit(loss_terms.switch_loss)
 
 
 def walk(count=6, period=0.01):
@@ -129,7 +123,7 @@ def test_a_fourth_term_is_tuned_told_and_written_from_one_place():
 def test_a_robot_that_is_elsewhere_can_still_go_as_fast_as_it_should():
     """Velocities count along the robot's own yaw; a file adds the terms by their names."""
     weights = (("L_vel", 2.0), ("L_yaw_rate", 3.0))
-    loss = loss_of_robot(replace(ROBOT.description, loss=weights))
+    loss = loss_terms.loss_of_robot(replace(ROBOT.description, loss=weights))
     assert loss[:3] == PAPER_LOSS
     ahead, aside = np.tile([0.5, 0.0, 0.0], (6, 1)), np.tile([0.0, 0.5, 0.0], (6, 1))
     quarter, there = np.tile([0.0, 0.0, np.pi / 2], (6, 1)), walk()

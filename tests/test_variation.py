@@ -11,15 +11,10 @@ from model import ANCHOR, ROBOT, robot_with
 from hector_jax import InputError, State, Wrench, named_command, nominal
 from hector_jax.grfm.effect import ground_effect, last_command
 from hector_jax.robot import srbm
+from hector_jax.tuning import variation as variations
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 from hector_jax.tuning.rollout import Scenario, rollout, rollout_config, with_variation
-from hector_jax.tuning.variation import (
-    drawn_variation,
-    estimate_error,
-    moved_by,
-    no_variation,
-    within_friction,
-)
+from hector_jax.tuning.variation import drawn_variation, moved_by, no_variation
 
 SCENARIO = Scenario(ROBOT, named_command("s"), ANCHOR, last_command)
 FEET = jnp.array([[0.02, 0.08, 0.0], [-0.01, -0.08, 0.0]])
@@ -75,14 +70,14 @@ def test_a_force_through_the_true_centre_of_mass_does_not_turn_the_body():
 
 def test_a_foot_that_slips_keeps_its_direction_and_load():
     force = jnp.array([[30.0, -20.0, 50.0], [15.0, 8.0, 50.0]])
-    found = within_friction(Wrench(force, force), jnp.asarray(0.5)).force
+    found = variations.within_friction(Wrench(force, force), jnp.asarray(0.5)).force
     # twice the limit keeps half of it, 23 of 25 N nearly all: the edge is smooth
     share = (1.0 + np.array([2.0, 23.0 / 25.0]) ** 8) ** (-1 / 8)
     np.testing.assert_allclose(found[:, :2], share[:, None] * force[:, :2])
     np.testing.assert_allclose(share, [0.5, 0.95], atol=1e-2)
     np.testing.assert_array_equal(found[:, 2], force[:, 2])
     none = Wrench(jnp.zeros((2, 3)), jnp.zeros((2, 3)))
-    assert np.isfinite(jax.grad(lambda f: within_friction(none, f).force.sum())(0.5))
+    assert np.isfinite(jax.grad(lambda f: variations.within_friction(none, f).force.sum())(0.5))
 
 
 def test_drawn_variations_are_as_robots_differ():
@@ -103,7 +98,7 @@ def test_drawn_variations_are_as_robots_differ():
 def test_the_error_of_the_estimate_has_its_stated_sizes():
     sizes = State(*(jnp.asarray(rows) for rows in np.linspace(0.01, 0.12, 12).reshape(4, 3)))
     noisy = BELIEVED._replace(noise=sizes)
-    draw = jax.jit(jax.vmap(lambda tick: estimate_error(noisy, tilted(), tick)))
+    draw = jax.jit(jax.vmap(lambda tick: variations.estimate_error(noisy, tilted(), tick)))
     for found, size in zip(draw(jnp.arange(2000)), sizes, strict=True):
         np.testing.assert_allclose(found.std(axis=0), size, rtol=0.1)
         assert (np.abs(found.mean(axis=0)) < 0.1 * size).all()

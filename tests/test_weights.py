@@ -6,16 +6,9 @@ import numpy as np
 import pytest
 
 from hector_jax.control import MpcConfig, WalkConfig, Weights, expert, nominal
+from hector_jax.control import weights as control_weights
 from hector_jax.control.parameters import TUNABLES, bounds
-from hector_jax.control.weights import (
-    between,
-    direction_names,
-    directions,
-    scale_weights,
-    vector_to_weights,
-    weight_names,
-    weights_to_vector,
-)
+from hector_jax.control.weights import vector_to_weights, weight_names, weights_to_vector
 
 
 @pytest.mark.parametrize("shape", [(24,), (3, 24), (2, 5, 24)])
@@ -48,12 +41,12 @@ def test_each_name_stands_where_its_weight_is_and_feet_share_theirs_in_every_dir
     assert weights.R.force[1, 0] == numbers["R_Fx_right"]
     assert weights.R.moment[1, 1] == numbers["R_My_right"]
     assert len(set(weight_names())) == 24
-    steps = directions()
-    assert len(direction_names()) == len(steps) == 18
+    steps = control_weights.directions()
+    assert len(control_weights.direction_names()) == len(steps) == 18
     assert (steps.sum(axis=0) == 1).all()
     step = np.zeros(18)
-    step[direction_names().index("R_Fz")] = np.log(2.0)
-    weights = scale_weights(nominal(), step)
+    step[control_weights.direction_names().index("R_Fz")] = np.log(2.0)
+    weights = control_weights.scale_weights(nominal(), step)
     np.testing.assert_allclose(weights.R.force[:, 2], 2.0 * nominal().R.force[:, 2])
     np.testing.assert_allclose(weights.R.force[:, :2], nominal().R.force[:, :2])
 
@@ -61,13 +54,13 @@ def test_each_name_stands_where_its_weight_is_and_feet_share_theirs_in_every_dir
 def test_between_two_sets_weights_are_geometric_means_and_other_numbers_lie_on_a_line():
     one, other = (w._replace(others={"turn_lead": x}) for w, x in ((nominal(), 0), (expert(), 1)))
     for share, end in ((0.0, one), (1.0, other)):
-        jax.tree.map(np.testing.assert_allclose, between(one, other, share), end)
-    third = between(one, other, 1 / 3)
+        jax.tree.map(np.testing.assert_allclose, control_weights.between(one, other, share), end)
+    third = control_weights.between(one, other, 1 / 3)
     assert third.others == {"turn_lead": pytest.approx(1 / 3)}
     cubes = weights_to_vector(nominal()) ** 2 * weights_to_vector(expert())
     np.testing.assert_allclose(weights_to_vector(third) ** 3, cubes, rtol=1e-12)
     points = Weights(nominal().Q, nominal().R._replace(moment=np.zeros((2, 0))))
-    assert between(points, points).R.moment.shape == (2, 0)
+    assert control_weights.between(points, points).R.moment.shape == (2, 0)
 
 
 def test_each_number_beside_the_weights_has_its_box_and_its_default_inside():
