@@ -13,21 +13,13 @@ from model import EXAMPLES, ROOT
 from oracles import mass_matrix
 from pretend import call
 
-from hector_jax import (
-    PAPER_LOSS,
-    Job,
-    RolloutConfig,
-    Scenario,
-    last_command,
-    load_robot,
-    rollout,
-    walk,
-)
+from hector_jax import PAPER_LOSS, Job, RolloutConfig, Scenario, last_command, rollout, walk
 from hector_jax.control import expert, named_command, nominal, standing_anchor, walk_config
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
 from hector_jax.report import pictures
+from hector_jax.robot.model import load_robot
 from hector_jax.sim.engine import ENGINES, MJX, MUJOCO_C, Engine, choose_engine
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.world import Push, build_world, hfs, ideal

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hector_jax.control import MpcConfig, WalkConfig, Weights, expert, nominal
+from hector_jax import nominal
+from hector_jax.control import MpcConfig, WalkConfig, Weights, expert
 from hector_jax.control import weights as control_weights
 from hector_jax.control.parameters import TUNABLES, bounds
 from hector_jax.control.weights import vector_to_weights, weight_names, weights_to_vector
