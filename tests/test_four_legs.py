@@ -40,8 +40,6 @@ FILE = EXAMPLES / "quadruped" / "robot.toml"
 ROBOT = load_robot(FILE)
 CONFIG = walk_config(ROBOT)
 ANCHOR = standing_anchor(ROBOT)
-
-
 GAITS = [("trot", [0.0, 0.5, 0.5, 0.0], 2), ("pace", [0.5, 0.0, 0.5, 0.0], 2)]
 GAITS += [("crawl", [0.75, 0.25, 0.5, 0.0], 3)]  # each hind foot before the front foot of its side
 
