@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from model import ROBOT
 from pretend import pretend_walk
-from test_sensing import stand
+from test_walk import stand
 
 from hector_jax import hfs, ideal
 from hector_jax.core.settings import from_table, to_table
