@@ -1,6 +1,8 @@
 """Weight sets in engines and models, and finished runs side by side: counts, claims, commands."""
 
 import json
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,7 +20,7 @@ from hector_jax.report import matrix as report
 from hector_jax.report.compare import compare_runs
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.standin import even, standin
-from hector_jax.store.folder import as_row, load_run
+from hector_jax.store.run import Run, as_row
 from hector_jax.verdict import judging, matrix
 from hector_jax.verdict.matrix import Column
 from hector_jax.verdict.metrics import make_verdict
@@ -236,7 +238,7 @@ def test_what_is_no_finished_run_is_told_by_its_file(runs, name, text, fault):
     if text is not None:
         (runs[0] / name).write_text(text)
     with pytest.raises(ValueError, match=fault) as told:
-        compare_runs([load_run(folder) for folder in runs])
+        compare_runs([Run(folder) for folder in runs])
     assert "\n" not in str(told.value)
 
 
@@ -246,3 +248,18 @@ def test_runs_of_different_losses_are_said_to_be_so(monkeypatch, capsys, tmp_pat
     runs = run_folder(tmp_path / "one", Tune(), {}), two
     assert call(monkeypatch, "evaluate", "--runs", *runs) == 0
     assert capsys.readouterr().out.count("losses differ") == said
+
+
+@pytest.mark.slow
+def test_two_evaluations_at_once_in_one_folder_walk_each_case_once(tmp_path):
+    line = "evaluate --traj straight --seeds 3 --seconds 0.1 --json --out both".split()
+    words = [sys.executable, "-m", "hector_jax", *line]
+    options = {"cwd": tmp_path, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    running = [subprocess.Popen(words, text=True, **options) for _ in range(2)]
+    one, other = (json.loads(program.communicate()[0]) for program in running)
+    assert one["columns"] == other["columns"]
+    rows = [json.loads(line) for line in (tmp_path / "both/walks.jsonl").read_text().splitlines()]
+    assert len({(row["set"], row["seed"]) for row in rows}) == len(rows) == 6
+    assert {(row["engine"], row["world"], row["model"]) for row in rows} == {
+        ("c", "standin", "own")
+    }

@@ -48,7 +48,7 @@ from hector_jax.export.check import (
     compile_controller,
     inputs_of,
 )
-from hector_jax.export.export import SCHEMA, controller_of_run, find_weights, weights_cpp
+from hector_jax.export.export import SCHEMA, weights_cpp
 from hector_jax.export.source import controller_source
 from hector_jax.export.template import fill_template
 from hector_jax.qp import QP, Status, solve_qp
@@ -56,6 +56,7 @@ from hector_jax.robot.model import load_robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import ideal
 from hector_jax.store.cache import robot_hash
+from hector_jax.store.run import Run
 
 pytestmark = pytest.mark.usefixtures("on_cpu")
 CONFIG = WalkConfig()
@@ -617,10 +618,8 @@ def test_a_run_is_exported_with_its_own_controller(run):
     kept = to_table(own)
     del kept["mpc"]["effort_reference"]  # of a run from before there was such a setting
     (run / "config.json").write_text(json.dumps({"tune": {"rollout": {"walk": kept}}}))
-    assert find_weights(run, "best") == run / "weights" / "best.json"
-    assert controller_of_run(run) == own
-    path = run / "weights" / "best.json"
-    assert find_weights(path, "best") == path
+    assert Run(run).weights_file("best") == run / "weights" / "best.json"
+    assert Run(run).controller == own
 
 
 def test_a_set_that_is_not_there_is_one_line_and_writes_nothing(monkeypatch, capsys, run):

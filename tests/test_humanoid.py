@@ -21,16 +21,15 @@ from hector_jax.control.contact import CORNER_FRICTION, FLAT_FOOT, Contact, rows
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.export.check import compare_with_live, compile_controller, compiler, record
-from hector_jax.export.export import controller_of_run, find_weights
 from hector_jax.export.source import controller_source
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.importing.remarks import differences
 from hector_jax.robot.description import Description
 from hector_jax.sim.parallel import walk_batch
-from hector_jax.store import folder as runs
 from hector_jax.store import nets
 from hector_jax.store.collection import load_walks
 from hector_jax.store.nets import CollectConfig
+from hector_jax.store.run import Run
 
 ROBOT = load_robot(EXAMPLES / "humanoid" / "robot.toml")
 CONFIG = walk_config(ROBOT)
@@ -230,9 +229,9 @@ def test_strider_is_tuned_by_the_same_command_and_a_run_knows_it(monkeypatch, st
     with pytest.raises(ValueError, match="made for another robot"):
         load_walks(tmp_path / "data" / "strider" / "walks", load_robot())
     (run,) = (tmp_path / "runs" / "strider" / "ahead").iterdir()
-    assert find_weights(run, "with") == run / "weights" / "with.json"
-    assert controller_of_run(run) == walk_config(strider)
-    assert runs.read_request(run).robot == STRIDER
+    assert Run(run).weights_file("with") == run / "weights" / "with.json"
+    assert Run(run).controller == walk_config(strider)
+    assert Run(run).request.robot == STRIDER
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     for name in ("without", "with"):
         L = [line["L"] for line in lines if line["set"] == name and line["accepted"]]

@@ -12,7 +12,7 @@ from pretend import pretend_walk, still_walk
 from hector_jax import PAPER_LOSS, InputError, LossTerm, last_command, named_command, nominal
 from hector_jax.core.trajectory import State, Wrench, has_fallen
 from hector_jax.report.report import render
-from hector_jax.store.folder import as_row
+from hector_jax.store.run import as_row
 from hector_jax.tuning import loss as loss_terms
 from hector_jax.tuning.difftune import TuneConfig, tune
 from hector_jax.tuning.loss import changes_between, losses, residuals, total

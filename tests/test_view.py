@@ -25,7 +25,7 @@ from hector_jax.grfm.network import save_net
 from hector_jax.report import fidelity, pictures, view
 from hector_jax.report.motion import motion
 from hector_jax.report.view import ViewedWalk, arrows
-from hector_jax.store import folder as runs
+from hector_jax.store import run as runs
 from hector_jax.store.cache import robot_hash
 
 
@@ -89,7 +89,7 @@ def test_both_walks_stand_on_one_reference_wherever_they_began():
 def test_metrics_of_a_run_that_goes_on_are_read_and_its_newest_weights_taken(tmp_path):
     run = pretend_run(tmp_path)
     write_metrics(run, 6, refused=(3,))
-    found = runs.read_histories(run)
+    found = runs.Run(run).histories
     again = [runs.as_row(name, i) for name, history in found.items() for i in history]
     write_rows(tmp_path / "again", again)
     assert (tmp_path / "again").read_bytes() == (run / "metrics.jsonl").read_bytes()
@@ -98,7 +98,7 @@ def test_metrics_of_a_run_that_goes_on_are_read_and_its_newest_weights_taken(tmp
     assert np.isnan(curve[3])
     assert curve[6] < curve[0] == 100.0
     for expected, words in ((nominal(), "with at iteration 6, so far"), (expert(), "with")):
-        weights, told = runs.weights_of(run, "with")
+        weights, told = runs.Run(run).weights("with")
         np.testing.assert_array_equal(weights_to_vector(weights), weights_to_vector(expected))
         assert told == words
         save_weights(run / "weights" / "with.json", expert())

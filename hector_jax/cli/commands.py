@@ -25,7 +25,7 @@ from hector_jax.importing.table import changes_of_model, section, table_of
 from hector_jax.robot.model import load_robot
 from hector_jax.sim import margin
 from hector_jax.store import nets
-from hector_jax.store.folder import read_request
+from hector_jax.store.run import Run
 from hector_jax.tuning.loss import loss_of_robot
 
 
@@ -148,9 +148,9 @@ def _write_robot(out: Path, proposal: RobotProposal, comments: Sequence[str], fi
 @run.register
 def run_export(args: flags.Export) -> None:
     """Export the controller of a run, checked against the live one; or fill a template."""
-    is_run = args.run.is_dir()
-    path = export.find_weights(args.run, args.set)
-    folder = args.out or (args.run if is_run else args.run.parent) / "export"
+    run = Run(args.run) if args.run.is_dir() else None
+    path = run.weights_file(args.set) if run else args.run
+    folder = args.out or (args.run if run else args.run.parent) / "export"
     if args.template:
         out = folder / args.template.name.removesuffix(".j2")
         if out.resolve() == args.template.resolve():
@@ -160,19 +160,17 @@ def run_export(args: flags.Export) -> None:
         print_result(args.json, {"file": str(out)}, lambda: None)
         say(f"{out} has the weights {path}")
         return
-    if is_run and args.robot:
+    if run and args.robot:
         raise InputError(f"--robot is for weights files; the run {args.run} names its own robot")
-    request = read_request(args.run) if is_run else None
-    config = export.controller_of_run(args.run) if is_run else None
-    robot = arguments.robot_of_run(args.run, request) if request else load_robot(args.robot)
-    text = request.trajectory if request else "straight"
+    robot = run.robot if run else load_robot(args.robot)
+    text = run.request.trajectory if run else "straight"
     trajectory = arguments.load_trajectory(text, robot)
-    name = f"{args.run.resolve().name}/{path.stem}" if is_run else path.stem
+    name = f"{args.run.resolve().name}/{path.stem}" if run else path.stem
     weights = arguments.weights_by_name(str(path), robot)
     say("exporting the controller and comparing it with the live one on a walk")
     with locked(folder):
         card = export.export(
-            config or walk_config(robot),
+            run.controller if run else walk_config(robot),
             robot,
             weights,
             trajectory.command,

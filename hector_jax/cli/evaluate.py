@@ -36,7 +36,7 @@ from hector_jax.sim.engine import Engine, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import Imperfections
 from hector_jax.store import tunings
-from hector_jax.store.folder import RESULT, load_run
+from hector_jax.store.run import Run
 from hector_jax.store.setup import Setup
 from hector_jax.verdict import judging
 from hector_jax.verdict.matrix import OWN, Column, Columns, cells_of
@@ -77,7 +77,7 @@ def run_evaluate(args: Evaluate) -> None:
     with nullcontext() if out is None else locked(out):
         with workers(args.processes, args.cluster) as pool:
             setup = Setup(pool, tunings.tune_config(plan.robot), plan.robot)
-            columns = _walk(setup, plan, out / "scores" if out else None)
+            columns = _walk(setup, plan, out)
         cells = cells_of(columns)
         result = report.matrix_report(cells, plan.differs, plan.world)
         if out is not None:
@@ -97,11 +97,12 @@ def _compare(args: Evaluate) -> None:
     names = (flag.name for flag in fields(args) if flag.name not in ("runs", "json", "config"))
     if beside := [f"--{name.replace('_', '-')}" for name in names if args.is_given(name)]:
         raise InputError(f"--runs compares what has walked already, so not beside {beside[0]}")
-    finished = [folder for folder in args.runs if (folder / RESULT).exists()]
-    for folder in args.runs:
-        if finished and folder not in finished:
-            say(f"{folder} is left out: it is not a finished run")
-    comparison = compare_runs([load_run(folder) for folder in finished or args.runs])
+    runs = list(map(Run, args.runs))
+    finished = [run for run in runs if run.is_finished]
+    for run in runs:
+        if finished and run not in finished:
+            say(f"{run.folder} is left out: it is not a finished run")
+    comparison = compare_runs(finished or runs)
     print_result(args.json, comparison, partial(print_comparison, comparison))
 
 
@@ -228,6 +229,7 @@ def _walk(setup: Setup, plan: EvaluationPlan, folder: Path | None) -> Columns:
             where=f" in {report.title_of(column)}" * (len(plan.columns) > 1),
             folder=folder,
             engine=plan.engines[column.engine],
+            about={"world": plan.world, "model": column.model},
         ).verdict
         for column in plan.columns
     }

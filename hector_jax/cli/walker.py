@@ -37,7 +37,7 @@ from hector_jax.robot.model import Robot, load_robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
 from hector_jax.store import tunings
-from hector_jax.store.folder import RESULT
+from hector_jax.store.run import RESULT
 from hector_jax.store.setup import Setup
 from hector_jax.verdict import judging, metrics
 from hector_jax.walk_tuning import best_set
@@ -169,8 +169,9 @@ def tune_walker(folder: Path, args: Tune) -> None:
         setup = Setup(pool, config, robot)
         options: dict[str, Any] = {
             "seconds": seconds,
-            "folder": folder / "scores",
+            "folder": folder,
             "engine": campaign.engine,
+            "about": {"world": "standin"},
         }
         for name, weights in compared.items():
             save_weights(folder / "weights" / f"{name}.json", weights)

@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int
 
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree import stack
-from hector_jax.tuning.loss import PAPER_LOSS, Loss, alphas, losses, switch_loss, total
+from hector_jax.tuning.loss import Loss, alphas, losses, switch_loss, total
 
 BASELINES = ("nominal", "expert", "start")
 
@@ -106,7 +106,7 @@ class Verdict(NamedTuple):
     @property
     def parts(self) -> tuple[str, ...]:
         """Names of the terms of the loss, and of their sum."""
-        return (*(term.name for term in self.loss), "L")
+        return parts_of(self.loss)
 
 
 class Summary(NamedTuple):
@@ -115,6 +115,11 @@ class Summary(NamedTuple):
     means: dict[str, Interval]  # over plants and scenes, by part
     falls: int  # walks in which it falls
     against: dict[str, Comparison]  # by the other set
+
+
+def parts_of(loss: Loss) -> tuple[str, ...]:
+    """Return the names of the terms of a loss, and of their sum."""
+    return (*(term.name for term in loss), "L")
 
 
 def score(loss: Loss, walk: Trajectory) -> Score:
@@ -138,13 +143,6 @@ def score(loss: Loss, walk: Trajectory) -> Score:
         legs_touch=np.asarray(float(walk.period) * np.sum(np.asarray(walk.legs_touch) & ~fallen)),
         residual=np.asarray(walk.residual, float).max(),
     )
-
-
-def score_like(*axes: int, loss: Loss = PAPER_LOSS) -> Score:
-    """Return a score of zeros with given leading axes, for `load_tree`."""
-    zero, vector = np.zeros(axes), np.zeros((*axes, 3))
-    parts = dict.fromkeys((*(term.name for term in loss), "L"), zero)
-    return Score(parts, zero, vector, vector, zero.astype(bool), zero, zero)
 
 
 def _rms(error: Float[np.ndarray, "*n 3"], rows: Bool[np.ndarray, "*n"]) -> Float[np.ndarray, "3"]:
