@@ -21,7 +21,6 @@ distributed = pytest.importorskip("distributed")
 
 @pytest.fixture(scope="module")
 def two():
-    """A scheduler here with two workers."""
     options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
     with distributed.LocalCluster(**options) as started:
         yield started

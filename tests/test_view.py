@@ -30,7 +30,6 @@ from hector_jax.store.cache import robot_hash
 
 
 def viewed(seed=0, **kwargs):
-    """A pretended walk."""
     walk = pretend_walk(seed, **kwargs)
     return ViewedWalk(walk, {"commanded": walk.command, "measured": walk.effect})
 
@@ -134,8 +133,8 @@ def page(request):
     server.stop()
 
 
-def test_the_page_answers_its_own_origins_only(page):
-    import viser
+def test_the_page_answers_its_own_origins_only_and_no_client_opens_a_tunnel(page, monkeypatch):
+    import viser._viser
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
 
@@ -151,11 +150,6 @@ def test_the_page_answers_its_own_origins_only(page):
     assert all(map(opens, [None, *own]))
     foreign = "https://evil.example", f"http://evil.example:{page[2]}", "http://localhost:1", "null"
     assert not any(map(opens, foreign))
-
-
-def test_no_client_of_the_page_opens_a_tunnel(page, monkeypatch):
-    import viser._viser
-
     opened = []
     monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *_: opened.append(1))
     assert page[0].request_share_url() is None  # what a client's message calls
@@ -179,7 +173,6 @@ def test_only_the_net_of_the_run_predicts(monkeypatch, capsys, tmp_path, own):
 
 
 def until(seconds, seen):
-    """Ask again until it is seen."""
     end = time.monotonic() + seconds
     while not seen():
         assert time.monotonic() < end, f"not seen within {seconds} s"
