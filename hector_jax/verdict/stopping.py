@@ -8,21 +8,21 @@ of x - m at even odds: with a share q of the stake on "below", averaged over q, 
     K_n = mean over q of (2 q)^b (2 (1 - q))^(n - b),    b plants with x < m,
 
 of a stake of 1, with q from Beta(1/4, 1/4) above 1/2. If P(x < m) <= 1/2, K_n is a nonnegative
-supermartingale, so it ever exceeds 1 / level with a probability of at most `level` (Ville),
+supermartingale, so it ever reaches 1 / level with a probability of at most `level` (Ville),
 whatever the distribution of x. All m that are excluded neither from below nor from above are the
-interval: it ends at two order statistics, as the other one does. Plants have to be
-independent draws; their order, and where one stops, are free.
-
-Beta(1/4, 1/4) lets six plants be enough for one claim, as they are for that one.
+interval: it ends at two order statistics, as the other one does. Plants have to be independent
+draws; where one stops is free. Beta(1/4, 1/4) lets six plants be enough for one claim, as they are
+for the other interval.
 
 Source: Howard and Ramdas, arXiv:1906.09712 (quantiles), with this mixture in place of theirs.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import count, takewhile
+from itertools import count
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from hector_jax.verdict import metrics
 from hector_jax.verdict.metrics import BASELINES, COVERAGE, Comparison, Verdict
@@ -33,7 +33,9 @@ UNCLEAR = "unclear"
 _SHAPE = 0.25  # of the Beta distribution of q
 
 
-def log_wealth(below: int, above: int) -> float:
+def log_wealth(
+    below: int | Int[np.ndarray, "*n"], above: int | Int[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n"]:
     """Return log K_n after `below` plants with x < m, and `above` other ones.
 
     >>> round(float(np.exp(log_wealth(1, 0))), 3)  # 2 E[q]
@@ -43,7 +45,7 @@ def log_wealth(below: int, above: int) -> float:
 
     a, b = below + _SHAPE, above + _SHAPE
     mixture = betaln(a, b) - betaln(_SHAPE, _SHAPE) + np.log(2.0 * betainc(b, a, 0.5))
-    return float((below + above) * np.log(2.0) + mixture)
+    return np.asarray((below + above) * np.log(2.0) + mixture)
 
 
 @dataclass(frozen=True)
@@ -56,8 +58,8 @@ class StoppingRule:
     def rank(self, plants: int) -> int:
         """Return the `Rank` of an interval of a median that holds at every number of plants."""
         least = -np.log((1.0 - COVERAGE) / 2.0 / self.claims)
-        enough = (log_wealth(plants - above, above) >= least for above in range(plants + 1))
-        return sum(takewhile(bool, enough))
+        above = np.arange(plants + 1)  # the wealth falls with it
+        return int(np.sum(log_wealth(plants - above, above) >= least))
 
     @property
     def fewest(self) -> int:
