@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pretend import call, instead, pretend_history, pretend_score, pretend_walk
+from pretend import call, instead, pretend_history, pretend_score, pretend_walk, refused
 
 from hector_jax import PAPER_LOSS, InputError, expert, nominal
 from hector_jax.cli import evaluate as command
@@ -24,6 +24,7 @@ from hector_jax.store.run import Run, as_row
 from hector_jax.verdict import judging, matrix
 from hector_jax.verdict.matrix import Column
 from hector_jax.verdict.metrics import make_verdict
+from hector_jax.verdict.stopping import StoppingRule
 
 C, DRAKE, HEAVY = Column("c", "own"), Column("drake", "own"), Column("c", "heavy")
 SETS = ("nominal", "expert", "with")
@@ -248,6 +249,67 @@ def test_runs_of_different_losses_are_said_to_be_so(monkeypatch, capsys, tmp_pat
     runs = run_folder(tmp_path / "one", Tune(), {}), two
     assert call(monkeypatch, "evaluate", "--runs", *runs) == 0
     assert capsys.readouterr().out.count("losses differ") == said
+
+
+def test_plants_stop_to_walk_when_every_set_is_clear_and_go_on_later(
+    monkeypatch, tmp_path, capsys, walked
+):
+    words = "evaluate", "--traj", "s", "--seeds", 32, "--processes", 5, "--out", tmp_path
+    assert call(monkeypatch, *words, "--until-clear") == 0
+    assert [job.seed for _, job in walked.jobs] == [seed for seed in range(6) for _ in range(2)]
+    told, err = capsys.readouterr()
+    line = "MuJoCo C, after 6 of at most 32 plants, against nominal: expert worse. "
+    line += "Saved 52 of 64 walks."
+    assert told.splitlines()[-1] == line
+    assert "at most 64 walks: 2 on each plant" in err
+    page = (tmp_path / "report.md").read_text()
+    assert f"- {line}\n" in page
+    assert "The walks decided how many plants walked" in page
+    (stop,) = json.loads((tmp_path / "verdict.json").read_text())["stopping"]
+    assert stop == {
+        **C._asdict(),
+        "plants": 6,
+        "most_plants": 32,
+        "walks": 12,
+        "walks_saved": 52,
+        "claims": {"s": {"expert": "worse"}},
+    }
+    assert call(monkeypatch, *words) == 0
+    assert len(walked.jobs) == 64
+    assert "of at most" not in capsys.readouterr().out
+    assert call(monkeypatch, *words, "--until-clear") == 0  # whatever walked before
+    assert capsys.readouterr().out == told
+    assert len(walked.jobs) == 64
+
+
+def test_each_engine_and_model_stops_where_it_is_clear(monkeypatch, capsys, walked):
+    words = "evaluate", "--traj", "s", "c", "--plant", "heavy", "--other-seeds", 16, "--json"
+    assert call(monkeypatch, *words, "--seeds", 12, "--until-clear") == 0
+    result = json.loads(capsys.readouterr().out)
+    fewest = StoppingRule(claims=4).fewest
+    assert [len(one["seeds"]) for one in result["columns"]] == [fewest, fewest]
+    saved = [one["walks_saved"] for one in result["stopping"]]
+    assert saved == [4 * (12 - fewest), 4 * (16 - fewest)]
+    assert len(result["claims"][1].split("; on c expert ")) == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--seeds", 5), "needs 6 plants or more for 1 claim, got 5 in MuJoCo C"),
+        (("--world", "hfs"), "needs 6 plants or more for 1 claim, got 1 in MuJoCo C"),
+        (
+            ("--plant", "heavy", "--other-seeds", 6),
+            "8 plants or more for 2 claims, got 6 in MuJoCo",
+        ),
+        (("--weights", "expert", "mine=best"), "--weights must be nominal, which changes are"),
+    ],
+)
+def test_what_can_never_be_clear_is_refused_before_a_walk(
+    monkeypatch, capsys, walked, words, expected
+):
+    assert expected in refused(monkeypatch, capsys, "evaluate", "--until-clear", *words)
+    assert not walked.jobs
 
 
 @pytest.mark.slow

@@ -249,7 +249,7 @@ class Evaluate(Configured, ForRobot, ByWalker, Parallel, Printed):
     Example: hector evaluate --weights nominal expert with=runs/tuned --traj all --plant light heavy
     """
 
-    usual = frozenset("weights runs traj world engine plant seeds robot out".split())
+    usual = frozenset("weights runs traj world engine plant seeds until_clear robot out".split())
     # nominal, expert, best, weights files, folders of straight.json, c.json, ...; or NAME=one
     weights: tuple[WeightSets, ...] = BASELINES
     runs: tuple[Run, ...] = ()  # instead: finished runs of `hector tune`, side by side
@@ -262,6 +262,8 @@ class Evaluate(Configured, ForRobot, ByWalker, Parallel, Printed):
     seeds: Plants = 8  # number of plants of the first model, in the first engine
     other_seeds: Plants = 8  # number of plants of each other model and engine
     first_seed: Seed = 0  # first plant
+    # stop before the last plant if every set is clearly better, worse or no different
+    until_clear: bool = False
     seconds: Seconds = 4.0  # length of each walk [s]; a whole eight takes 8
     # folder for a report; a later call continues there
     out: Annotated[Path | None, PathKind.FOLDER] = None

@@ -6,7 +6,7 @@ robot, engine or code adds rows of its own.
 """
 
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -37,6 +37,7 @@ from hector_jax.store.setup import Setup
 from hector_jax.tuning.loss import Loss
 from hector_jax.tuning.rollout import Scenario, rollout, rollout_config
 from hector_jax.verdict import metrics
+from hector_jax.verdict.stopping import StoppingRule, is_clear
 
 TABLE = "walks.jsonl"
 # modules that determine the numbers, for `content_key`
@@ -201,32 +202,60 @@ def _file_name(case: Case, key: str) -> str:
 
 
 def judge_jobs(
-    setup: Setup, jobs: Mapping[Case, Job], *, where: str = "", **options: Any
+    setup: Setup,
+    jobs: Mapping[Case, Job],
+    *,
+    title: str,
+    where: str = "",
+    rule: StoppingRule | None = None,
+    **options: Any,
 ) -> Judged:
     """Walk every set on every trajectory and plant, score the walks and say their faults.
 
     Args:
-        setup, options: see `score_jobs`.
+        setup, title, options: see `score_jobs`.
         jobs: a job for each trajectory, set and seed.
         where: what follows the name of a set where its faults are said.
+        rule: says when the other plants, in the order of the jobs, need not walk; None: all walk.
     """
-    results = score_jobs(setup, jobs, **options)
-    walks = {case: walk for case, (walk, _) in results.items()}
-    scenes, names, seeds = (list(dict.fromkeys(labels)) for labels in zip(*jobs, strict=True))
-    groups = {
-        (scene, name): [walks[scene, name, seed] for seed in seeds]
-        for scene in scenes
-        for name in names
-    }
-    on = {scene: f" on {scene}{where}" if len(scenes) > 1 else where for scene in scenes}
-    say_faults({f"{name}{on[scene]}": walks for (scene, name), walks in groups.items()})
-    scores = {
-        scene: {name: [walk.score for walk in groups[scene, name]] for name in names}
-        for scene in scenes
-    }
-    verdict = metrics.make_verdict(setup.config.loss, seeds, scores)
-    stored = {case: walk for case, (_, walk) in results.items() if walk is not None}
+    seeds, walks, stored = _seeds_of(jobs), {}, {}
+    for batch in rule.batches(len(seeds)) if rule else [range(len(seeds))]:
+        plants = seeds[batch.start : batch.stop]
+        next_jobs = {case: job for case, job in jobs.items() if case[2] in plants}
+        remark = f", plants {batch.start + 1} to {batch.stop} of {len(seeds)}" if rule else ""
+        results = score_jobs(setup, next_jobs, title=title + remark, **options)
+        walks |= {case: walk for case, (walk, _) in results.items()}
+        stored |= {case: walk for case, (_, walk) in results.items() if walk is not None}
+        if rule and is_clear(_verdict_of(setup, walks, rule)):
+            break
+    verdict = _verdict_of(setup, walks, rule)
+    for scene, by_set in _by_set(walks).items():
+        on = f" on {scene}{where}" if len(verdict.scenes) > 1 else where
+        say_faults({f"{name}{on}": group for name, group in by_set.items()})
     return Judged(walks, verdict, stored)
+
+
+def _seeds_of(cases: Iterable[Case]) -> list[int]:
+    return list(dict.fromkeys(seed for *_, seed in cases))
+
+
+def _by_set(walks: Mapping[Case, ScoredWalk]) -> dict[str, dict[str, list[ScoredWalk]]]:
+    """Return the walks by trajectory and set, in the order of their plants."""
+    groups: dict[str, dict[str, list[ScoredWalk]]] = {}
+    for (trajectory, name, _), walk in walks.items():
+        groups.setdefault(trajectory, {}).setdefault(name, []).append(walk)
+    return groups
+
+
+def _verdict_of(
+    setup: Setup, walks: Mapping[Case, ScoredWalk], rule: StoppingRule | None
+) -> metrics.Verdict:
+    scores = {
+        scene: {name: [walk.score for walk in group] for name, group in by_set.items()}
+        for scene, by_set in _by_set(walks).items()
+    }
+    rank = rule.rank if rule else metrics.fixed_rank
+    return metrics.make_verdict(setup.config.loss, _seeds_of(walks), scores, rank)
 
 
 def judge(
