@@ -90,7 +90,7 @@ def _pace(time: np.ndarray, period: float, span: float) -> float:
 def _clock(time: np.ndarray, period: float, interval: float) -> tuple[list[str], float]:
     """Return a line for each way in which a clock is uneven, and its pace without its gaps."""
     lines, apart, width = [], np.diff(time), max(round(WINDOW / period), 5)
-    if back := np.sum(apart < 0.0):
+    if back := int(np.sum(apart < 0.0)):
         was = "is" if back == 1 else "are"
         lines.append(f"{plural(back, 'stamp')} of time {was} before that of the sample before")
     if (equal := np.mean(apart == 0.0)) > MOST_EQUAL:
