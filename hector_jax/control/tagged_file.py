@@ -6,9 +6,10 @@ A tag is a comment of that file, in its own syntax, with the weights of the numb
     double Q[7] = {25, 25, 30, 9, 9, 8, 0};   // hector: Q.euler, Q.position, -
     (0,0)  1e-4    ; hector: R.force[left][2] * 0.5
 
-`*` and `/` lead from the weight to the file: the last has half of it. `[all]` is one number for all
-feet or axes, `-` one that is no weight. If its line has no number, a tag is of those below. JSON
-has no comments: gains.hector.toml has the keys of gains.json, with a tag in place of each number.
+`*` and `/` lead from the weight to the file: the last has half of it. `R.force[all]` is three
+numbers, of all feet; `-` is one that is no weight. If its line has no number, a tag is of those
+below. JSON has no comments: gains.hector.toml has the keys of gains.json, with a tag in place of
+each number.
 """
 
 import json
@@ -50,7 +51,7 @@ class Place(NamedTuple):
     where: str  # file and line
     tag: str
     name: str  # of the entry
-    cells: tuple[int, ...]  # of the flattened entry; several for `[all]`
+    cells: tuple[int, ...]  # of the flattened entry; several for `name[all]`
     factor: Fraction  # of the number by the weight
 
 
