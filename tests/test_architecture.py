@@ -19,7 +19,7 @@ DOORS |= {"viser": ("report.view",), "trimesh": ("report.view",), "flax": ("grfm
 DOORS |= {"optax": ("grfm.nets", "tuning.difftune", "tuning.step_rules")}
 DOORS |= {"jaxopt": ("qp.jaxopt_solver",)}
 DOORS |= {"matplotlib": ("report.plots",), "tyro": ("cli.parse",)}
-DOORS |= {"jinja2": ("report.report", "export.source", "export.template")}
+DOORS |= {"jinja2": ("report.report", "export.source")}
 DOORS |= dict.fromkeys(("cma", "cmaes", "botorch", "torch"), ())
 DOORS |= {"hector_jax.importing": ("importing.", "cli.commands")}  # robots of others
 

@@ -37,7 +37,6 @@ from hector_jax.control.reference import Command, named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.console import Broken
-from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import to_table
 from hector_jax.core.trajectory import State, pack_wrench
 from hector_jax.export import check, export
@@ -50,7 +49,6 @@ from hector_jax.export.check import (
 )
 from hector_jax.export.export import SCHEMA, weights_cpp
 from hector_jax.export.source import controller_source
-from hector_jax.export.template import fill_template
 from hector_jax.qp import QP, Status, solve_qp
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.loop import Job
@@ -626,40 +624,3 @@ def test_a_set_that_is_not_there_is_one_line_and_writes_nothing(monkeypatch, cap
     line = refused(monkeypatch, capsys, "export", run, "--set", "bset")
     assert "did you mean 'best'" in line
     assert not (run / "export").exists()
-
-
-# A template
-
-
-def filled(folder, text):
-    (folder / "gains.j2").write_bytes(text.encode())
-    return fill_template(folder / "gains.j2", nominal())
-
-
-@pytest.mark.parametrize(
-    "text", ["a\r\nb {{ Q.euler[0] }}\r\n", "a\nb {{ Q.euler[0] }}\n", "{{ Q.euler[0] }}"]
-)
-def test_a_filled_template_has_the_line_ends_of_its_file(tmp_path, text):
-    number = str(float(nominal().Q.euler[0]))
-    assert filled(tmp_path, text) == text.replace("{{ Q.euler[0] }}", number)
-
-
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        ("{{ 1/0 }}", "division by zero"),
-        ("{{ Q. }}", "line 1: "),
-        ("{{ Q.yaw[0] }}", "no attribute 'yaw'.*there are Q.euler"),
-        ("{{ Q.euler[0] + friction }}", "'friction' is undefined"),
-        ("{% macro f() %}{{ f() }}{% endmacro %}{{ f() }}", "recursion"),
-        ('{{ cycler.__init__.__globals__.os.popen("touch ran") }}', "unsafe"),
-        ("double a[]{{1, 2, 3}};", r"a number or text, got \(1, 2, 3\)"),
-        ("{{ Q.euler }}", "a number or text, got"),
-    ],
-)
-def test_what_a_template_cannot_print_is_told_in_one_line(tmp_path, monkeypatch, text, told):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(InputError, match=told) as found:
-        filled(tmp_path, text)
-    assert len(str(found.value).splitlines()) == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["gains.j2"]

@@ -20,7 +20,6 @@ from pretend import USUAL, call
 
 from hector_jax.control.controller import walk_config
 from hector_jax.control.weights import expert, nominal
-from hector_jax.control.weights_file import save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import named_leaves
@@ -370,17 +369,3 @@ def test_hector_tune_finds_what_its_walks_show(tmp_path, monkeypatch, capsys):
     ):
         assert call(monkeypatch, *words) == 2
         assert f"its walks are those of {tmp_path / 'mine.py'}" in capsys.readouterr().err
-
-
-def test_a_file_of_numbers_is_filled_in_in_its_order_and_units(tmp_path, monkeypatch, capsys):
-    template, weights = tmp_path / "gains.yaml.j2", tmp_path / "mine.json"
-    save_weights(weights, nominal(ROBOT))
-    text = 'q: [{{ Q.position[2] }}, {{ Q.euler[0] }}]\nr: {{ "%.2f" % (1e4 * R.force[0][2]) }}\n'
-    line = ("export", weights, "--template", template, "--out", tmp_path)
-    template.write_text(text)
-    assert call(monkeypatch, *line) == 0
-    assert (tmp_path / "gains.yaml").read_text() == "q: [50.0, 50.0]\nr: 1.00\n"
-    capsys.readouterr()
-    assert call(monkeypatch, "export", "best", *line[2:], "--json") == 0  # that comes along
-    assert json.loads(capsys.readouterr().out) == {"file": str(tmp_path / "gains.yaml")}
-    assert float((tmp_path / "gains.yaml").read_text()[4:].split(",")[0]) > 0.0

@@ -9,15 +9,16 @@ from typing import Any
 from hector_jax.cli import arguments, doctor, evaluate, flags, propose, tune, view, walk, walker
 from hector_jax.cli.arguments import print_result
 from hector_jax.control.controller import walk_config
+from hector_jax.control.tagged_file import keys_file, read_own, with_weights
 from hector_jax.control.twin import TwinConfig
 from hector_jax.control.weights import nominal
+from hector_jax.control.weights_file import weights_tree
 from hector_jax.core.console import say
 from hector_jax.core.files import locked, write_file
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
 from hector_jax.core.settings import as_toml
 from hector_jax.export import export
-from hector_jax.export.template import fill_template
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.importing.propose import RobotProposal, propose_robot, standard_form
 from hector_jax.importing.remarks import differences, remarks
@@ -147,16 +148,19 @@ def _write_robot(out: Path, proposal: RobotProposal, comments: Sequence[str], fi
 
 @run.register
 def run_export(args: flags.Export) -> None:
-    """Export the controller of a run, checked against the live one; or fill a template."""
+    """Export the controller of a run, checked against the live one; or numbers of a file."""
     run = Run(args.run) if args.run.is_dir() else None
     path = run.weights_file(args.set) if run else args.run
     folder = args.out or (args.run if run else args.run.parent) / "export"
-    if args.template:
-        out = folder / args.template.name.removesuffix(".j2")
-        if out.resolve() == args.template.resolve():
-            raise InputError(f"--template {out} would be overwritten; name it {out.name}.j2")
+    if args.into:
+        out, keys = folder / args.into.name, keys_file(args.into)
+        if out.resolve() == args.into.resolve():
+            raise InputError(f"--into {out} would be overwritten; write to another folder by --out")
         weights = arguments.weights_by_name(str(path), load_robot(args.robot))
-        write_file(out, fill_template(args.template, weights).encode())
+        text = with_weights(args.into, read_own(args.into), weights_tree(weights))
+        write_file(out, text.encode(errors="surrogateescape"))
+        if keys:  # with which the copy is read
+            write_file(folder / keys.name, keys.read_bytes())
         print_result(args.json, {"file": str(out)}, lambda: None)
         say(f"{out} has the weights {path}")
         return

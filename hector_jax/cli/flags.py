@@ -341,9 +341,9 @@ class Export(Printed):
     set: str = "best"  # weight set of the run
     out: Path | None = None  # folder; by default `export` in the run or beside the weights file
     seconds: Seconds = 1.0  # length of the walk of its check after the start-up [s]
-    robot: RobotFile = None  # TOML file, with a weights file or --template; HECTOR by default
-    # write no controller, but fill this file of numbers of another one: {{ Q.euler[0] }}, ..
-    template: Annotated[Path | None, PathKind.FILE] = None
+    robot: RobotFile = None  # TOML file, with a weights file or --into; HECTOR by default
+    # write no controller, but a copy of this file of another one with the weights at its tags
+    into: Annotated[Path | None, PathKind.FILE] = None
 
 
 @_command

@@ -89,7 +89,7 @@ def controller_source(
     mpc, footsteps = config.mpc, FootstepConfig()
     ours = footsteps.travel, footsteps.ahead
     if config.twin != TwinConfig() or (config.footstep.travel, config.footstep.ahead) != ours:
-        raise InputError("a twin is not exported, but a file of numbers is: --template")
+        raise InputError("a twin is not exported, but the numbers of a file are: --into")
     constraints = [part.name for part in (*mpc.on("inputs"), *mpc.on("states"))]
     own = [part for part in constraints if part not in _SIDES] + [c.name for c in mpc.costs]
     if own:
