@@ -10,6 +10,7 @@ calibration is of plants of hfs-varied, which no verdict uses: OUT/foretold.json
 has. On plants of a verdict the report counts the intervals that hold what was walked.
 """
 
+import json
 from collections.abc import Sequence
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
@@ -42,23 +43,23 @@ from hector_jax.sim.standin import FAMILIES
 from hector_jax.sim.world import named_world
 from hector_jax.store import tunings
 from hector_jax.verdict import metrics
-from hector_jax.verdict.foretell import GROUPS, calibrated, foretell, interval, quantities
+from hector_jax.verdict.foretell import ELSEWHERE, HERE, calibrated, foretell, interval, quantities
 
 SPREAD = 0.4  # standard deviation of a random step, in log-weights
-HERE, ELSEWHERE = GROUPS
 
 
 @dataclass(frozen=True, kw_only=True)
 class Flags(lib.Flags):
     """What to walk."""
 
-    robots: tuple[str, ...] = ("hector=-",)  # NAME=FILE, its TOML; - is HECTOR
+    robots: tuple[str, ...] = ("hector=-",)  # NAME=FILE, its TOML; - is HECTOR; empty: --add alone
     traj: tuple[str, ...] = ("straight", "c", "s", "sideways", "turn")
     engines: tuple[str, ...] = ("c",)
     world: str = "hfs-varied"  # of the plants; standin and standin-even are for verdicts
     plants: int = 24
     first_plant: int = 9200
     sets: int = 4  # that each log foretells
+    add: tuple[Path, ...] = ()  # foretell.json of earlier calls, whose pairs are taken in
     out: Path = Path("runs/foretell")
 
 
@@ -148,7 +149,9 @@ def log_job(case: Case, count: int) -> list[Pair]:
 
 def calibration(pairs: Sequence[Pair]) -> dict[str, Any]:
     """Return the pairs by group, as `verdict.foretell` reads them."""
-    groups = {group: [p for p in pairs if is_here(p) == (group == HERE)] for group in GROUPS}
+    groups = {
+        group: [p for p in pairs if is_here(p) == (group == HERE)] for group in (HERE, ELSEWHERE)
+    }
     return {
         "code": code_hash("verdict.foretell"),
         "pairs": {
@@ -189,7 +192,7 @@ def main(flags: Flags) -> Path:
         Case(name, file, engine, traj, flags.world, seed)
         for (name, file), engine, traj, seed in product(robots, flags.engines, flags.traj, seeds)
     ]
-    pairs: list[Pair] = []
+    pairs = [Pair(**pair) for path in flags.add for pair in json.loads(path.read_text())["pairs"]]
     with workers(flags.processes) as pool, bar("logs and what they foretell") as report_progress:
         running = [pool.submit(log_job, case, flags.sets) for case in cases]
         for done, job in enumerate(as_completed(running), 1):

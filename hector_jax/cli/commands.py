@@ -6,7 +6,18 @@ from functools import partial, singledispatch
 from pathlib import Path
 from typing import Any
 
-from hector_jax.cli import arguments, doctor, evaluate, flags, propose, tune, view, walk, walker
+from hector_jax.cli import (
+    arguments,
+    doctor,
+    evaluate,
+    flags,
+    foretell,
+    propose,
+    tune,
+    view,
+    walk,
+    walker,
+)
 from hector_jax.cli.arguments import print_result
 from hector_jax.control.controller import walk_config
 from hector_jax.control.tagged_file import keys_file, read_own, with_weights
@@ -43,6 +54,7 @@ def run(args: Any) -> None:
 for _command in (
     doctor.run_doctor,
     evaluate.run_evaluate,
+    foretell.run_foretell,
     walk.run_walk,
     walk.run_grfm,
     walker.run_check,

@@ -311,6 +311,20 @@ class Twin(Check, ByPlanner):
 
 
 @_command
+class Foretell(ForRobot, ByPlanner, Printed):
+    """Foretell from logs of walks what other weights would bring on the robot that walked.
+
+    Example: hector log foretell mine.npz --walked nominal --weights expert best
+    """
+
+    logs: tuple[Annotated[Path, PathKind.FILE], ...]  # of one robot and one trajectory
+    walked: Weights = "nominal"  # with which they were walked: a file, nominal, expert or best
+    weights: tuple[Weights, ...] = ("best",)  # that are foretold
+    traj: Trajectory = "straight"  # that was walked: a name or a TOML file
+    seconds: Seconds = 4.0  # length of the walks [s]
+
+
+@_command
 class Robot(Flags):
     """Report what a robot's model holds and what is wrong with it, and propose its TOML file.
 

@@ -35,11 +35,11 @@ from hector_jax.verdict.metrics import Interval, Score
 
 COVERAGE = 0.9  # of an interval
 FEWEST = 40  # pairs of a group: below that it has no interval
-_FLOOR = 0.1  # of a log ratio: errors of a forecast grow with what it foretells beyond this
+_FLOOR = 0.3  # of a log ratio: errors of a forecast grow with what it foretells beyond this
 _PAIRS = Path(__file__).with_name("foretold.json")
 
-GROUPS = ("here", "elsewhere")
-"""Pairs of HECTOR in MuJoCo; and of other robots and engines, for logs that were made elsewhere."""
+HERE, ELSEWHERE = "here", "elsewhere"
+"""Groups of pairs: HECTOR in MuJoCo; other robots and engines, for logs made elsewhere."""
 
 
 class Foretold(NamedTuple):
@@ -161,7 +161,7 @@ def forecast(foretold: Foretold, name: str, group: str) -> dict[str, Interval]:
     Args:
         foretold: of one log.
         name: of the set.
-        group: of `GROUPS`.
+        group: HERE or ELSEWHERE.
 
     Raises:
         InputError: the weights are farther from those of the log than any that was measured.
