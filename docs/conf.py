@@ -66,7 +66,7 @@ PUBLIC = {  # of packages without `__all__`, in whichever of their modules they 
     "grfm": "Window Effect Phi as_effect load_net save_net TrainConfig train",
     "tuning": """RolloutConfig rollout LossTerm losses with_alphas TuneConfig Evaluation Tuning
         PlanInputs Planned tune descend""",
-    "store": "load_run load_walks",
+    "store": "Run load_walks",
     "verdict": "Score score Verdict make_verdict",
     "importing": "propose_robot standard_form",
     "own": "program_of Walker walker_engine compare_plans compare_calls",

@@ -171,7 +171,7 @@ def main(flags: Flags) -> Path:
         sets |= {"start": start, "search": answer}
         inputs, judged = (Setup(pool, config, robot), sets, commands), {}
         for title, part in (("own", slice(count)), ("others", slice(count, None))):
-            options = {"title": f"walking on the {title} plants", "folder": folder / "scores"}
+            options = {"title": f"walking on the {title} plants", "folder": folder}
             judged[title] = judging.judge(*inputs, plants[part], seeds[part], **options).verdict
     rows, numbers = [], {}
     for title, verdict in judged.items():

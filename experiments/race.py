@@ -148,7 +148,7 @@ def judge(
     seeds = range(flags.first_plant, flags.first_plant + flags.plants)
     plants = [named_world("hfs-varied", seed, setup.robot.description) for seed in seeds]
     sets = {"nominal": nominal(setup.robot), TUNER: weights}
-    options = {"folder": flags.out / "scores", "engine": campaign.engine}
+    options = {"folder": flags.out, "engine": campaign.engine}
     inputs = setup, sets, campaign.commands, plants, seeds
     verdict = judging.judge(*inputs, title="judging the tuner", **options).verdict
     falls = {name: int(score.fallen.sum()) for name, score in verdict.scores.items()}

@@ -69,7 +69,7 @@ def walk_robot(flags: Flags, pool: Executor, name: str, file: Path | None) -> Lo
         own = {name: w for name, w in sets.items() if name.split("-")[0] in (command, "all")}
         compared = {"nominal": nominal(robot), **own}
         inputs = setup, compared, {command: named_command(command)}, plants, seeds
-        options = {"title": f"{name}: walking {command}", "folder": flags.out / "scores" / name}
+        options = {"title": f"{name}: walking {command}", "folder": flags.out / name}
         scores = judging.judge(*inputs, **options).verdict.scores
         losses[command] = {key: score.L[:, 0].tolist() for key, score in scores.items()}
     return losses

@@ -7,7 +7,7 @@ controller is told of none of it.
     python experiments/robustness.py --set tuned=runs/straight/TIME/weights/best.json
 
 `hfs-varied` is the world to choose by; `--plants standin=6364-6371` is for verdicts on what was
-chosen. The scores of finished walks are stored under OUT/scores, and a later call uses them.
+chosen. The scores of finished walks are rows of OUT/walks.jsonl, and a later call uses them.
 """
 
 import re
@@ -122,8 +122,9 @@ def walk_world(flags: Flags, setup: Setup, sets: Mapping[str, Weights], world: s
         for seed, plant in zip(seeds, plants, strict=True)
         for name, weights in sets.items()
     }
-    title, folder = f"{plural(len(jobs), 'walk')} on {world}", flags.out / "scores"
-    judged = judging.judge_jobs(setup, jobs, title=title, folder=folder, engine=CHANGING)
+    title, folder = f"{plural(len(jobs), 'walk')} on {world}", flags.out
+    options = {"folder": folder, "engine": CHANGING, "about": {"world": world}}
+    judged = judging.judge_jobs(setup, jobs, title=title, **options)
     return {
         (*at, name): score
         for at, labelled in levels.items()

@@ -21,7 +21,7 @@ static struct controller_estimate standing(void) {
 static double uniform(double size) { return size * (2.0 * rand() / RAND_MAX - 1.0); }
 
 static int step(int64_t ms, const struct controller_estimate *e) {
-    return controller_step(&c, ms, e, NULL, NULL, &out);
+    return controller_step_at(&c, ms, e, NULL, NULL, &out);
 }
 
 /* The largest amount by which a foot pulls, slides or exceeds 500 N, as the friction is 0.6. */
@@ -70,6 +70,33 @@ int test_blind(void) { /* no good input: the last torques, then damping, also on
     CHECK(step(CONTROLLER_MAX_AGE + 3, &e) == CONTROLLER_UNSAFE);
     controller_reset(&c);
     CHECK(step(CONTROLLER_MAX_AGE + 4, &e) == CONTROLLER_SOLVED && out.torque[3] == last);
+    return 0;
+}
+
+int test_refused(void) { /* without a clock: refused calls leave no trace, but too many of them do */
+    static struct controller one, two;
+    struct controller_output other = { { 0 } };
+    struct controller_estimate e = standing(), lost = e;
+    lost.velocity[0] = NAN;
+    out = other;
+    controller_init(&one), controller_init(&two);
+    for (int ms = 0; ms < 300; ++ms) {
+        e.velocity[0] = 0.001 * (ms % 30);
+        for (int k = 0; k < ms % 7; ++k) {
+            struct controller before = one;
+            double last = out.torque[3];
+            CHECK(controller_step(&one, &lost, NULL, NULL, &out) == CONTROLLER_BAD_INPUT);
+            CHECK(memcmp(&one, &before, sizeof one) == 0 && out.torque[3] == last);
+        }
+        CHECK(controller_step(&one, &e, NULL, NULL, &out) == CONTROLLER_SOLVED);
+        CHECK(controller_step_at(&two, ms, &e, NULL, NULL, &other) == CONTROLLER_SOLVED);
+        CHECK(memcmp(&out, &other, sizeof out) == 0 && memcmp(&one, &two, sizeof one) == 0);
+    }
+    for (int k = 0; k < CONTROLLER_MAX_AGE; ++k)
+        CHECK(controller_step(&one, &lost, NULL, NULL, &out) == CONTROLLER_BAD_INPUT);
+    CHECK(controller_step(&one, &lost, NULL, NULL, &out) == CONTROLLER_UNSAFE);
+    CHECK(controller_step(&one, &e, NULL, NULL, &out) == CONTROLLER_UNSAFE && out.torque[3] == 0.0);
+    CHECK(controller_step(&one, &e, NULL, NULL, &out) == CONTROLLER_UNSAFE);
     return 0;
 }
 
@@ -123,7 +150,7 @@ int test_two_threads(void) { /* plan and hold as two calls do what step does, al
     CHECK(controller_hold(&memory, 0, &targets, &e, &other) == CONTROLLER_BAD_INPUT);
     for (int64_t ms = 0; ms < 500; ++ms) {
         e.velocity[0] = 0.001 * (double)(ms % 30);
-        controller_step(&one, ms, &e, NULL, NULL, &out);
+        controller_step_at(&one, ms, &e, NULL, NULL, &out);
         if (ms % CONTROLLER_PERIOD == 0) {
             CHECK(controller_plan(&two, ms, &e, NULL, NULL) == CONTROLLER_SOLVED);
             targets = two.targets;

@@ -37,7 +37,7 @@ int main(int count, char **words) {
         }
         if (ms == (stands ? to + 3000 : CONTROLLER_TICK_0))
             controller_drive(&controller, 0.3, 0.0, 0.5);
-        others += controller_step(&controller, ms, &e, NULL, NULL, &out) != CONTROLLER_SOLVED;
+        others += controller_step_at(&controller, ms, &e, NULL, NULL, &out) != CONTROLLER_SOLVED;
         mju_copy(d->ctrl, out.torque, CONTROLLER_JOINTS);
         mj_step(m, d);
     }

@@ -11,6 +11,7 @@ import signal
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -81,8 +82,12 @@ JOBS = {job.__name__: job for job in (collection, table)}
 
 
 def newest(folder: Path) -> tuple[int, ...]:
-    """Times of the last change of all folders below: each save changes one."""
-    return tuple(sorted(f.stat().st_mtime_ns for f in (folder, *folder.glob("*/")) if f.is_dir()))
+    """Times of the last change of all that is below: each save changes one."""
+    times = []
+    for place in (folder, *folder.rglob("*")):
+        with suppress(FileNotFoundError):  # a part that has been renamed
+            times.append(place.stat().st_mtime_ns)
+    return tuple(sorted(times))
 
 
 def killed(child: int, folder: Path, saves: int, wait: float) -> bool:

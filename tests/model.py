@@ -8,17 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from synthetic import synthetic_walk
 
-from hector_jax.control.controller import WalkConfig
+from hector_jax import RolloutConfig, TuneConfig, WalkConfig, load_robot
 from hector_jax.control.reference import Command, standing_anchor
 from hector_jax.control.weights import expert, vector_to_weights, weights_to_vector
 from hector_jax.grfm.dataset import at_interval, make_dataset
 from hector_jax.grfm.network import as_effect, effect_of
 from hector_jax.grfm.residual import init, with_statistics
 from hector_jax.robot.description import TuningSettings
-from hector_jax.robot.model import load_robot
-from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import mean_objective
-from hector_jax.tuning.rollout import RolloutConfig
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
@@ -56,7 +53,6 @@ def small_net(seed=0):
 
 
 def small_effect(seed=0):
-    """Phi of `small_net`."""
     return as_effect(small_net(seed))
 
 
@@ -72,5 +68,4 @@ def random_weights(seed, about=expert, factor=3.0):
 
 
 def mean_of(objectives, losses=None):
-    """The mean of objectives, see `mean_objective`."""
     return mean_objective(lambda weights: [one.slope(weights) for one in objectives], losses)

@@ -7,8 +7,7 @@ import numpy as np
 import scipy.linalg
 from scipy.optimize import linprog
 
-from hector_jax.core.trajectory import State
-from hector_jax.qp import QP
+from hector_jax import QP, State
 
 
 def dense_rows(A: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from hector_jax.cli.main import main
 from hector_jax.control.weights import nominal
-from hector_jax.core.trajectory import State, Trajectory, Wrench, no_samples
+from hector_jax.core.trajectory import State, Wrench, no_samples
 from hector_jax.core.tree import stack
 from hector_jax.tuning.difftune import Iteration, Tuning
 from hector_jax.tuning.evaluate import Evaluation
@@ -48,7 +48,6 @@ def files(folder):
 
 
 def call(monkeypatch, *words):
-    """Run a line of the console script in this process; its exit code."""
     monkeypatch.setattr(sys, "argv", ["hector", *map(str, words)])
     return main()
 
@@ -74,9 +73,11 @@ class HandsOver(Executor):
         return done
 
 
-def no_belief(count):
-    """Of a controller that knows all, without integral action."""
-    return jax.tree.map(lambda x: np.zeros((count, *x.shape[1:])), no_samples(10, 2).belief)
+def still_walk(count, **parts):
+    """Samples of two legs that are all zero but for these parts; the controller knows all."""
+    walk = jax.tree.map(lambda x: np.zeros((count, *np.shape(x)[1:])), no_samples(10, 2))
+    flags = {name: np.zeros(count, bool) for name in ("fallen", "legs_touch")}
+    return walk._replace(**flags | parts)
 
 
 def pretend_walk(seed=0, error=0.03, seconds=4.0, period=0.01, fall_at=None, turn=0.0):
@@ -92,24 +93,17 @@ def pretend_walk(seed=0, error=0.03, seconds=4.0, period=0.01, fall_at=None, tur
     reference = State(euler, along + [0, 0, 0.5], zero, velocity)
     slow = rng.normal(size=(2, 3)) * error
     sway = np.stack([np.sin(2 * step), np.sin(step), np.cos(2 * step)], axis=1)
-    state = State(
-        reference.euler + 1.5 * error * sway + slow[0] * t[:, None] / seconds,
-        reference.position + 0.3 * error * sway + slow[1] * t[:, None] / seconds,
-        zero,
-        reference.velocity,
-    )
+    euler = reference.euler + 1.5 * error * sway + slow[0] * t[:, None] / seconds
+    position = reference.position + 0.3 * error * sway + slow[1] * t[:, None] / seconds
+    state = reference._replace(euler=euler, position=position)
     left = np.mod(t - period / 2, 0.4) < 0.2
     contact = np.stack([left, ~left], axis=1)
     carried = contact[..., None] * np.array([0.0, 0.0, 118.0])
     shape = np.stack([np.sin(step), np.cos(step), np.sin(2 * step)], axis=1)[:, None]
-    command = Wrench(
-        carried + contact[..., None] * shape * [15, 20, 10],
-        contact[..., None] * shape * [0, 2.0, 1.0],
-    )
-    effect = Wrench(
-        0.9 * command.force + rng.normal(size=(count, 2, 3)) * [2, 2, 5],
-        0.7 * command.moment + 0.1 * rng.normal(size=(count, 2, 3)),
-    )
+    shape = contact[..., None] * shape
+    command = Wrench(carried + shape * [15, 20, 10], shape * [0, 2.0, 1.0])
+    force = 0.9 * command.force + rng.normal(size=(count, 2, 3)) * [2, 2, 5]
+    effect = Wrench(force, 0.7 * command.moment + 0.1 * rng.normal(size=(count, 2, 3)))
     fallen = np.zeros(count, bool)
     if fall_at is not None:
         fallen = t > fall_at
@@ -118,21 +112,10 @@ def pretend_walk(seed=0, error=0.03, seconds=4.0, period=0.01, fall_at=None, tur
     swing = 0.3 * np.sin(step)
     left_leg = np.stack([0 * t, 0 * t, 0.6 + swing, -1.2 - 0.3 * abs(swing), 0.6 - swing], axis=1)
     right_leg = np.stack([0 * t, 0 * t, 0.6 - swing, -1.2 - 0.3 * abs(swing), 0.6 + swing], axis=1)
-    return Trajectory(
-        period=np.array(period),
-        initial=State(np.zeros(3), np.array([0, 0, 0.5]), np.zeros(3), np.zeros(3)),
-        state=state,
-        reference=reference,
-        command=command,
-        effect=effect,
-        contact=contact,
-        feet=feet,
-        joints=np.concatenate([left_leg, right_leg], axis=1),
-        fallen=fallen,
-        legs_touch=np.zeros(count, bool),
-        residual=np.zeros(count),
-        belief=no_belief(count),
-    )
+    parts = {"reference": reference, "command": command, "effect": effect, "contact": contact}
+    parts |= {"feet": feet, "joints": np.concatenate([left_leg, right_leg], axis=1)}
+    parts["initial"] = State(*np.zeros((4, 3)))._replace(position=np.array([0, 0, 0.5]))
+    return still_walk(count, period=np.array(period), state=state, fallen=fallen, **parts)
 
 
 def elsewhere(walk, place, yaw):
@@ -143,14 +126,10 @@ def elsewhere(walk, place, yaw):
         rates = state.ang_velocity @ R.T, state.velocity @ R.T
         return State(state.euler + [0.0, 0.0, yaw], state.position @ R.T + place, *rates)
 
-    return walk._replace(
-        initial=moved(walk.initial),
-        state=moved(walk.state),
-        reference=moved(walk.reference),
-        command=Wrench(*(part @ R.T for part in walk.command)),
-        effect=Wrench(*(part @ R.T for part in walk.effect)),
-        feet=walk.feet @ R.T + place,
-    )
+    parts = {name: moved(getattr(walk, name)) for name in ("initial", "state", "reference")}
+    for name in ("command", "effect"):
+        parts[name] = Wrench(*(part @ R.T for part in getattr(walk, name)))
+    return walk._replace(feet=walk.feet @ R.T + place, **parts)
 
 
 def pretend_score(loss, fallen=False):
@@ -174,13 +153,11 @@ def pretend_verdict(seeds=8, fallen=(), scenes=("straight",)):
     scores = {}
     for number, scene in enumerate(scenes, 1):
         noise = np.random.default_rng(number).normal(size=(len(SETS), seeds))
-        scores[scene] = {
-            name: [
-                pretend_score(level[name] * plant[i] * np.exp(0.05 * row[i]), (name, i) in fallen)
-                for i in range(seeds)
-            ]
-            for name, row in zip(SETS, noise, strict=True)
-        }
+        scores[scene] = {}
+        for name, row in zip(SETS, noise, strict=True):
+            losses = level[name] * plant * np.exp(0.05 * row)
+            each = [pretend_score(loss, (name, i) in fallen) for i, loss in enumerate(losses)]
+            scores[scene][name] = each
     return make_verdict(PAPER_LOSS, range(seeds), scores)
 
 
@@ -188,11 +165,8 @@ def pretend_history(iterations=10, pace=5.0, refused=(), **others):
     """A tuning whose loss falls; refused iterations are not finite. `others` are tuned too."""
     history, weights = [], nominal()._replace(others=others)
     for i in range(iterations + 1):
-        terms = {
-            "L_Eul": np.array(8 * np.exp(-i / pace) + 2),
-            "L_pos": np.array(6 * np.exp(-i / 9) + 1),
-            "L_ctrl": np.array(5.5e5 + 2e4 * np.sqrt(i)),
-        }
+        terms = {"L_Eul": 8 * np.exp(-i / pace) + 2, "L_pos": 6 * np.exp(-i / 9) + 1}
+        terms = jax.tree.map(np.array, terms | {"L_ctrl": 5.5e5 + 2e4 * np.sqrt(i)})
         loss = np.array(np.nan if i in refused else float(total(PAPER_LOSS, terms)))
         found = Evaluation(loss, terms, weights, np.array(0.0), np.array(1e-12))
         status = StepStatus.NOT_FINITE if i in refused else StepStatus.ACCEPTED
@@ -209,8 +183,3 @@ def tuning_of(history, weights=None, stop=Stop.LIMIT):
     weights = last.weights if weights is None else weights
     precision = np.outer(direction, direction) + 0.01 * np.eye(len(direction))
     return Tuning(weights, last.evaluation.loss, precision, np.array(stop), stack(history))
-
-
-def pretend_tuning(iterations=30, weights=None, **history):
-    """The tuning of `pretend_history`, which leads to given weights, by default nominal."""
-    return tuning_of(pretend_history(iterations, **history), weights)

@@ -27,7 +27,7 @@ LEG = """
     <geom class="visual" mesh="thigh"/>
     <body name="{s}_shin" pos="0 0 -0.2">
       {shin}
-      <joint name="{s}_knee" axis="0 1 0" {range}/>
+      <joint name="{s}_knee" axis="0 1 0" {knee}/>
       <body name="{s}_foot" pos="0 0 -0.2">
         <inertial pos="0.01 0 -0.02" mass="0.2" diaginertia="0.0002 0.0003 0.0002"/>
         <joint name="{s}_ankle" axis="0 1 0" range="-1 1" pos="0 0 0.01"/>
@@ -72,39 +72,23 @@ BIPED = """<mujoco model="small">
 JOINTS = [f"{s}_{j}" for s in ("left", "right") for j in ("roll", "pitch", "knee", "ankle")]
 MOTORS = "".join(MOTOR.format(joint) for joint in JOINTS)
 ANGLES = {"pitch": -0.3, "knee": 0.6, "ankle": -0.3}
+SIDES, CONTACTS = ("left", "right"), ((0.07, 0.0, -0.04), (-0.05, 0.0, -0.04))
+TEXTS = {"free": "<freejoint/>", "more": "", "arm": "", "shin": SHIN, "motors": MOTORS}
+TEXTS |= {"knee": 'range="-0.1 2"', "thigh": 'pos="0.01 0 -0.02"'}
 
 
-def small(
-    folder,
-    free="<freejoint/>",
-    more="",
-    arm="",
-    shin=SHIN,
-    knee='range="-0.1 2"',
-    thigh='pos="0.01 0 -0.02"',
-    motors=MOTORS,
-    ankle=-0.3,
-    contacts=((0.07, 0.0, -0.04), (-0.05, 0.0, -0.04)),
-    **changes,
-):
-    """The small biped and its description."""
-    legs = {
-        s: LEG.format(s=s, y=y, shin=shin, range=knee, thigh=thigh)
-        for s, y in (("left", 0.1), ("right", -0.1))
-    }
+def small(folder, ankle=-0.3, contacts=CONTACTS, **changes):
+    """The small biped, of which some texts may be others, and its description."""
+    texts = {name: changes.pop(name, text) for name, text in TEXTS.items()}
+    legs = {s: LEG.format(s=s, y=y, **texts) for s, y in zip(SIDES, (0.1, -0.1), strict=True)}
     path = folder / "robot.xml"
-    path.write_text(BIPED.format(free=free, more=more, arm=arm, motors=motors, **legs))
-    angles = {f"{s}_{j}": a for s in ("left", "right") for j, a in ANGLES.items()}
+    path.write_text(BIPED.format(**texts, **legs))
+    angles = {f"{s}_{j}": a for s in SIDES for j, a in ANGLES.items()}
     angles |= {"waist": 0.4, "shoulder": 1.0, "left_ankle": ankle, "right_ankle": ankle}
-    fields = {
-        "model": path,
-        "joints": tuple(JOINTS),
-        "linkage": None,
-        "weld": ("waist", "shoulder"),
-        "standing": tuple(angles.items()),
-        "feet": tuple(Foot(None, contacts, f"{s}_foot") for s in ("left", "right")),
-    }
-    return Description(**{**fields, **changes})
+    fields = {"model": path, "joints": tuple(JOINTS), "linkage": None}
+    fields |= {"weld": ("waist", "shoulder"), "standing": tuple(angles.items())}
+    fields["feet"] = tuple(Foot(None, contacts, f"{s}_foot") for s in SIDES)
+    return Description(**fields | changes)
 
 
 def place(pos, quat):
@@ -158,8 +142,6 @@ def by_numbers(folder, text):
     path.write_text(text)
     bend = {"hip_pitch": np.pi / 4, "knee": -np.pi / 2, "ankle": np.pi / 4}
     angles = {f"{s}_{j}": float(a) for s in ("left", "right") for j, a in bend.items()}
-    feet = tuple(
-        Foot((0.0, 0.0, -0.04), ((0.09, 0.0, -0.04), (-0.06, 0.0, -0.04)), f"{side}_foot")
-        for side in ("left", "right")
-    )
+    point, sole = (0.0, 0.0, -0.04), ((0.09, 0.0, -0.04), (-0.06, 0.0, -0.04))
+    feet = tuple(Foot(point, sole, f"{side}_foot") for side in SIDES)
     return Description(model=path, standing=tuple(angles.items()), feet=feet)

@@ -6,7 +6,7 @@ that nothing can predict.
 
 import jax
 import numpy as np
-from pretend import no_belief
+from pretend import still_walk
 
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 
@@ -50,18 +50,9 @@ def synthetic_walk(seed: int, ticks: int = 400, noise: float = 1.0) -> Trajector
     euler[:, 2] = yaw
     motion = rng.normal(size=(3, samples + 1, 3))
     states = State(euler, *motion)
-    return Trajectory(
-        period=np.array(0.001),
-        initial=jax.tree.map(lambda s: s[0], states),
-        state=jax.tree.map(lambda s: s[1:], states),
-        reference=jax.tree.map(lambda s: s[1:], states),
-        command=Wrench(fine(command[..., :3]), fine(command[..., 3:])),
-        effect=Wrench(fine(effect[..., :3]) + ripple, fine(effect[..., 3:]) + 0.1 * ripple),
-        contact=np.repeat(stands, SUBSTEPS, axis=0),
-        feet=rng.normal(size=(samples, 2, 3)),
-        joints=rng.normal(size=(samples, 10)),
-        fallen=np.zeros(samples, bool),
-        legs_touch=np.zeros(samples, bool),
-        residual=np.zeros(samples),
-        belief=no_belief(samples),
-    )
+    states, initial = jax.tree.map(lambda s: s[1:], states), jax.tree.map(lambda s: s[0], states)
+    effect = Wrench(fine(effect[..., :3]) + ripple, fine(effect[..., 3:]) + 0.1 * ripple)
+    parts = {"command": Wrench(fine(command[..., :3]), fine(command[..., 3:])), "effect": effect}
+    parts |= {"contact": np.repeat(stands, SUBSTEPS, axis=0), "initial": initial}
+    parts |= {"feet": rng.normal(size=(samples, 2, 3)), "joints": rng.normal(size=(samples, 10))}
+    return still_walk(samples, period=np.array(0.001), state=states, reference=states, **parts)

@@ -15,13 +15,11 @@ import pytest
 from lib import sample_weights
 from model import ANCHOR, ROBOT, mean_of, vector
 
-from hector_jax.control.reference import named_command
+from hector_jax import TuneConfig, last_command, named_command, tune
 from hector_jax.control.weights import directions, nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.tree import stack
-from hector_jax.grfm.effect import last_command
 from hector_jax.tuning import batch, difftune
 from hector_jax.tuning.batch import PER_CALL, BatchProblem, BatchScenario, tail_weights, tune_batch
-from hector_jax.tuning.difftune import TuneConfig, tune
 from hector_jax.tuning.evaluate import Evaluation, Objective
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
 from hector_jax.tuning.parallel_rollout import parallel_rollout

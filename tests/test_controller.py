@@ -9,25 +9,12 @@ import numpy as np
 import pytest
 from model import HEIGHT, ROBOT, WEIGHT
 
-from hector_jax.control.controller import (
-    WalkConfig,
-    actuate,
-    contacts_needed,
-    init_memory,
-    limit_errors,
-    measured_feet,
-    plan,
-    plan_horizon,
-    step_plan,
-)
-from hector_jax.control.gait import GaitConfig
+from hector_jax import State, WalkConfig, expert, named_command
+from hector_jax.control import Anchor, GaitConfig, actuate, controller, init_memory, plan, step_plan
 from hector_jax.control.legs import Measurement, stance_torques
 from hector_jax.control.mpc import Horizon, MpcConfig
 from hector_jax.control.parameters import TUNABLES, Q
-from hector_jax.control.reference import Anchor, named_command
-from hector_jax.control.weights import expert
 from hector_jax.core.geometry import rotation_from_euler
-from hector_jax.core.trajectory import State
 from hector_jax.qp import Status
 from hector_jax.robot.model import compile_model, describe
 
@@ -35,7 +22,7 @@ CONFIG = WalkConfig()
 STRAIGHT = named_command("straight")
 ANCHOR = Anchor(jnp.array([0.0, 0.0, HEIGHT]), jnp.array(0.0), jnp.array(0))
 
-feet_of = jax.jit(lambda measurement: measured_feet(ROBOT, measurement))
+feet_of = jax.jit(lambda measurement: controller.measured_feet(ROBOT, measurement))
 
 
 @partial(jax.jit, static_argnames="max_contacts")
@@ -53,7 +40,6 @@ def commanded(decided, memory, substep, measurement):
 
 
 def standing(x=0.0):
-    """A robot in the standing pose somewhere."""
     zero = jnp.zeros(3)
     state = State(zero, jnp.array([x, 0.0, HEIGHT]), zero, zero)
     return Measurement(state, jnp.asarray(ROBOT.standing_joints), jnp.zeros(10))
@@ -63,9 +49,6 @@ def at(tick, measurement=None, memory=None, max_contacts=1):
     measurement = standing() if measurement is None else measurement
     memory = init_memory(ROBOT, measurement) if memory is None else memory
     return planned(jnp.array(tick), memory, measurement, max_contacts=max_contacts)
-
-
-# What it measures
 
 
 @pytest.mark.parametrize("euler", [(0, 0, 0), (0.1, -0.2, 0.3), (-0.1, 0.1, 3.5), (0, 0.1, -9)])
@@ -90,9 +73,6 @@ def test_measured_feet_are_those_of_mujoco_and_their_yaw_is_as_continuous_as_the
         assert abs(feet.yaw[foot] - euler[2]) < 0.5
 
 
-# What it remembers
-
-
 def test_a_standing_foot_is_remembered_and_a_flying_one_is_not():
     old = init_memory(ROBOT, standing())
     now = standing(x=0.2)
@@ -104,9 +84,6 @@ def test_a_standing_foot_is_remembered_and_a_flying_one_is_not():
     later, _ = at(25, standing(x=0.4), memory)
     np.testing.assert_allclose(later.liftoff.position[0], feet.position[0])
     np.testing.assert_allclose(later.liftoff.position[1, 0] - memory.liftoff.position[1, 0], 0.4)
-
-
-# What it plans
 
 
 def test_every_number_that_the_plan_reads_has_a_derivative_and_compiles_nothing():
@@ -155,14 +132,6 @@ def test_the_numbers_beside_the_weights_are_those_of_the_weights_or_of_the_confi
         assert np.shape(one.read(CONFIG.parameters(expert()))) == one.shape(), name
 
 
-def test_before_the_gait_both_feet_share_the_weight():
-    _, decided = at(-110, max_contacts=2)
-    assert decided.contact.tolist() == [True, True]
-    assert decided.swing_ticks.tolist() == [0, 0]
-    np.testing.assert_allclose(decided.wrench.force[:, 2], WEIGHT / 2, rtol=0.2)
-    np.testing.assert_allclose(decided.wrench.force[0, 2], decided.wrench.force[1, 2], rtol=1e-3)
-
-
 @pytest.mark.parametrize(
     ("tick", "foot", "swung"), [(0, 0, 0), (19, 0, 19), (20, 1, 0), (39, 1, 19), (-61, 0, 19)]
 )
@@ -171,8 +140,7 @@ def test_the_stance_foot_carries_the_robot_and_the_other_nothing(tick, foot, swu
     assert decided.status == Status.SOLVED
     assert decided.residual < 1e-8
     assert bool(decided.contact[foot])
-    assert decided.swing_ticks[foot] == 0
-    assert decided.swing_ticks[1 - foot] == swung
+    assert (decided.swing_ticks[foot], decided.swing_ticks[1 - foot]) == (0, swung)
     assert 0.5 * WEIGHT < decided.wrench.force[foot, 2] < 2 * WEIGHT
     assert not np.asarray(decided.wrench.force[1 - foot]).any()
     assert not np.asarray(decided.wrench.moment[1 - foot]).any()
@@ -192,14 +160,14 @@ def test_an_error_beyond_the_limit_counts_as_the_limit():
     away = state._replace(position=state.position + jnp.array([0.3, -0.4, 0.02]))
     ahead = State(*jnp.zeros((4, 3, 3)))
     horizon = Horizon(ahead, ahead.euler, *[jnp.zeros((3, 2))] * 2, jnp.ones((3, 2), bool))
-    moved = limit_errors(horizon, away, state, 0.1).reference
+    moved = controller.limit_errors(horizon, away, state, 0.1).reference
     np.testing.assert_allclose(moved.position, [[0.24, -0.32, 0.0]] * 3, atol=1e-9)
     np.testing.assert_array_equal(moved.euler, 0.0)
     for yaw, shift in ((2.0, 1.7), (0.25, 0.0), (-0.5, -0.2)):
         turned = state._replace(euler=jnp.array([0.1, 0.2, yaw]))
-        euler = limit_errors(horizon, turned, state, np.inf, 0.3).reference.euler
+        euler = controller.limit_errors(horizon, turned, state, np.inf, 0.3).reference.euler
         np.testing.assert_allclose(euler, [[0.0, 0.0, shift]] * 3, atol=1e-9)
-    place = lambda x: limit_errors(horizon, x, state, np.inf).reference.position  # noqa: E731
+    place = lambda x: controller.limit_errors(horizon, x, state, np.inf).reference.position  # noqa: E731
     unlimited = jax.grad(lambda x: place(x)[0, 0])
     assert not any(part.any() for part in unlimited(state))  # and is finite without an error
 
@@ -210,7 +178,7 @@ def test_a_foot_that_lands_twice_within_the_horizon_lands_a_stride_further():
     walking = jax.tree.map(jnp.asarray, standing())
     state = walking.state._replace(velocity=jnp.array([0.5, 0.0, 0.0]))
     asked = {"command": STRAIGHT, "anchor": ANCHOR, "tick": jnp.array(0)}
-    ahead_of = jax.jit(partial(plan_horizon, config, ROBOT, config.footstep.parameters))
+    ahead_of = jax.jit(partial(controller.plan_horizon, config, ROBOT, config.footstep.parameters))
     horizon, _, touchdown = ahead_of(**asked, state=state, feet=feet_of(walking))
     stands = np.asarray(horizon.contact)
     assert stands.sum(axis=1).tolist() == [1] * 15
@@ -220,16 +188,19 @@ def test_a_foot_that_lands_twice_within_the_horizon_lands_a_stride_further():
     assert ahead == pytest.approx(0.5 * 0.2, abs=0.01)  # a cycle further on
 
 
-def test_room_for_two_feet_is_needed_before_the_gait_and_in_double_support():
-    assert [contacts_needed(CONFIG, tick) for tick in (-110, -81, -80, 0, 400)] == [2, 2, 1, 1, 1]
+def test_before_the_gait_both_feet_share_the_weight_and_have_room_as_in_double_support():
+    _, decided = at(-110, max_contacts=2)
+    assert decided.contact.tolist() == [True, True]
+    assert decided.swing_ticks.tolist() == [0, 0]
+    np.testing.assert_allclose(decided.wrench.force[:, 2], WEIGHT / 2, rtol=0.2)
+    np.testing.assert_allclose(decided.wrench.force[0, 2], decided.wrench.force[1, 2], rtol=1e-3)
+    needed = partial(controller.contacts_needed, CONFIG)
+    assert list(map(needed, (-110, -81, -80, 0, 400))) == [2, 2, 1, 1, 1]
     double = WalkConfig(gait=GaitConfig(stance=24, swing=16))
-    assert contacts_needed(double, 0) == 2
+    assert controller.contacts_needed(double, 0) == 2
 
 
-# What it asks of the joints
-
-
-def test_a_stance_leg_pushes_what_was_planned_and_a_swing_leg_is_pulled_on():
+def test_a_stance_leg_pushes_as_planned_a_swing_leg_is_pulled_on_and_ticks_join():
     measurement = standing()
     memory, decided = at(22, measurement)
     now, later = (commanded(decided, memory, jnp.array(ms), measurement) for ms in (0, 9))
@@ -237,10 +208,6 @@ def test_a_stance_leg_pushes_what_was_planned_and_a_swing_leg_is_pulled_on():
     np.testing.assert_allclose([now[5:], later[5:]], [expected[5:]] * 2, atol=1e-9)
     assert now[8] > 5.0  # the knee holds the weight
     assert later[3] < now[3] - 0.5  # and that of the other leg bends more and more
-
-
-def test_the_last_millisecond_of_a_tick_is_the_first_of_the_next():
-    measurement = standing()
     memory, decided = at(25, measurement)
     next_tick = decided._replace(swing_ticks=decided.swing_ticks + jnp.array([1, 0]))
     one = commanded(decided, memory, jnp.array(10), measurement)

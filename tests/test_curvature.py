@@ -1,4 +1,4 @@
-"""Gradient and Gauss-Newton matrix by the steps of a tuning against differences; its words."""
+"""Gradient and Gauss-Newton matrix by the steps of a tuning, also of rollouts that are grounded."""
 
 from dataclasses import replace
 from functools import partial
@@ -7,27 +7,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from model import ANCHOR, PLAIN, ROBOT, mean_of
+from model import AHEAD, ANCHOR, BRIEF, PLAIN, ROBOT, mean_of
+from pretend import elsewhere, still_walk
 
-from hector_jax.control import MpcConfig, Squares, StateCost
+from hector_jax import InputError, Job, RolloutConfig, Scenario, TuneConfig, hfs, rollout, walk
+from hector_jax.control import MpcConfig, Squares, StateCost, named_command, nominal
 from hector_jax.control.parameters import gradient_by_steps, stepped
-from hector_jax.control.reference import named_command
-from hector_jax.control.weights import direction_names, expert
-from hector_jax.control.weights_file import load_weights, save_weights
-from hector_jax.core.inputs import InputError
+from hector_jax.control.weights import direction_names, expert, vector_to_weights, weights_to_vector
+from hector_jax.control.weights_file import best, load_weights, save_weights
+from hector_jax.core.trajectory import State, Wrench
 from hector_jax.tuning.curvature import determined, least_squares_jit
-from hector_jax.tuning.difftune import (
-    TuneConfig,
-    init,
-    model_slope,
-    trial_weights,
-    tune,
-    tune_step,
-    update,
-)
+from hector_jax.tuning.difftune import init, model_slope, trial_weights, tune, tune_step, update
 from hector_jax.tuning.evaluate import Objective, evaluate_jit
+from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
 from hector_jax.tuning.loss import PAPER_LOSS, losses, residuals, total
-from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
+from hector_jax.walk_tuning.best_set import drawn_plants
 
 NAMES = direction_names()
 OTHERS = ("turn_lead", "footstep_feedback", "horizontal_gain", "yaw_gain")
@@ -51,10 +45,8 @@ def _rolled(command, z, direction):
     return jax.jvp(walk, (z,), (direction,), has_aux=True)
 
 
-OBJECTIVES = [
-    Objective(partial(model_slope, CONFIG, Scenario(ROBOT, named_command(name), ANCHOR, PLAIN)))
-    for name in COMMANDS
-]
+SCENARIOS = [Scenario(ROBOT, named_command(name), ANCHOR, PLAIN) for name in COMMANDS]
+OBJECTIVES = [Objective(partial(model_slope, CONFIG, scenario)) for scenario in SCENARIOS]
 
 
 def point(objective):
@@ -83,12 +75,9 @@ def test_the_gradient_by_steps_is_that_of_differences_and_of_the_forward_mode():
             parts = [float(rolled(name, z, along)[part]) for name in COMMANDS]
             return shares @ np.array(parts)
 
-        slopes = [
-            (mean(Z + h * direction, 0) - mean(Z - h * direction, 0)) / (2 * h)
-            for h in (1e-5, 3e-6)
-        ]
-        reverse = float(direction @ found.gradient)
-        assert np.abs(np.array(slopes) - reverse).min() <= 1e-6 * size
+        h, reverse = np.array([1e-5, 3e-6]), float(direction @ found.gradient)
+        rises = [mean(Z + x * direction, 0) - mean(Z - x * direction, 0) for x in h]
+        assert np.abs(rises / (2 * h) - reverse).min() <= 1e-6 * size
         assert abs(mean(Z, 1) - reverse) <= 1e-9 * size
     value = shares @ np.array([float(rolled(name, Z)[0]) for name in COMMANDS])
     assert float(found.value) == pytest.approx(value, rel=1e-10)
@@ -147,9 +136,6 @@ def test_the_weight_of_a_cost_of_ones_own_is_tuned_and_saved(tmp_path):
         replace(config, others=("cost_sped",))
 
 
-# What the walks determine
-
-
 def test_directions_are_said_with_the_weights_that_matter_in_them():
     vector, ridge = np.zeros(18), 0.05
     vector[[NAMES.index("Q_pitch"), NAMES.index("Q_x"), NAMES.index("R_Fz")]] = 0.9, -0.43, 0.05
@@ -169,3 +155,86 @@ def test_directions_are_said_with_the_weights_that_matter_in_them():
     assert "Q_pitch" not in found.left_open
     nothing = determined(ridge * np.eye(18), ridge, NAMES)
     assert (nothing.directions, nothing.left_open) == ([], [*NAMES])
+
+
+SCENARIO = Scenario(ROBOT, AHEAD, ANCHOR, PLAIN)
+
+
+def shaking(size):
+    """A walk that the model does not explain: a robot that only stands, and shakes."""
+    ticks, rng = BRIEF.ticks, np.random.default_rng(0)
+    place = np.append(np.asarray(ROBOT.com_offset)[:2], ROBOT.standing_height)
+    shake = size * rng.standard_normal((ticks, 3))
+    state = State(shake, shake + place, shake, shake)
+    force = np.broadcast_to(np.asarray(ROBOT.mass * ROBOT.gravity) / 2, (ticks, 2, 3))
+    parts = {"period": np.array(0.01), "initial": jax.tree.map(lambda x: x[0] - shake[0], state)}
+    parts["joints"] = np.broadcast_to(ROBOT.standing_joints, (ticks, 10))
+    return still_walk(ticks, state=state, command=Wrench(force, np.zeros_like(force)), **parts)
+
+
+@pytest.fixture(scope="module")
+def measured():
+    return shaking(1e-3)
+
+
+@pytest.fixture(scope="module")
+def grounding(measured):
+    return fit_grounding(BRIEF, SCENARIO, nominal(), measured)
+
+
+def evaluate(grounding, weights):
+    return evaluate_jit(BRIEF, grounding, weights, PAPER_LOSS, walk=grounded_rollout)
+
+
+def test_a_grounded_rollout_is_its_walk_with_the_slope_of_differences_and_a_matrix(
+    grounding, measured
+):
+    again = jax.jit(grounded_rollout, static_argnums=0)(BRIEF, grounding, nominal())
+    for found, there in zip(again.state, measured.state, strict=True):
+        np.testing.assert_allclose(found, there[1:], atol=1e-12)
+    assert not again.fallen.any()
+    theta = np.asarray(weights_to_vector(nominal()))
+
+    def loss(logs):
+        weights = vector_to_weights(theta * np.exp(logs))
+        return float(evaluate(grounding, weights).loss)
+
+    found = evaluate(grounding, nominal())
+    slope = theta * np.asarray(weights_to_vector(found.gradient))
+    for direction in np.linalg.qr(np.random.default_rng(0).normal(size=(24, 3)))[0].T:
+        expected = (loss(1e-5 * direction) - loss(-1e-5 * direction)) / 2e-5
+        assert slope @ direction == pytest.approx(expected, rel=1e-5)
+    weights = BRIEF.walk.with_others(nominal(), ["turn_lead"])
+    options = {"walk": grounded_rollout, "others": ("turn_lead",)}
+    matrix = np.asarray(least_squares_jit(BRIEF, grounding, weights, PAPER_LOSS, **options)[1])
+    assert matrix.shape == (19, 19)
+    np.testing.assert_allclose(matrix, matrix.T, rtol=1e-9, atol=1e-9 * np.abs(matrix).max())
+    assert np.linalg.eigvalsh(matrix)[0] > -1e-9 * np.abs(matrix).max()
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_with_the_weights_of_a_log_the_planned_commands_are_those_of_the_log(noise):
+    """With integral action, whose memory is not empty when the log begins, and a wrong estimate."""
+    config, weights, command = BRIEF.walk, best(), named_command("s")
+    plant = drawn_plants(ROBOT, 1)[0] if noise else hfs()
+    seconds = BRIEF.ticks * config.gait.tick
+    walked = walk(config, ROBOT, Job(weights, command, plant, seconds, seed=3))
+    stride = round(config.gait.tick / float(walked.period))
+    rows = walked._replace(period=None, initial=None)
+    log = jax.tree.map(lambda x: x[stride - 1 :: stride], rows)
+    log = log._replace(period=np.array(config.gait.tick), initial=walked.initial)
+    assert np.abs(log.belief.disturbance.linear).max() > 0.1
+    assert np.any(log.belief.state.position) == noise
+    grounding = fit_grounding(BRIEF, Scenario(ROBOT, command, ANCHOR, PLAIN), weights, log)
+    again = jax.jit(grounded_rollout, static_argnums=0)(BRIEF, grounding, weights)
+    for found, there in zip(again.command, log.command, strict=True):
+        np.testing.assert_allclose(found, there[1:], atol=1e-6)
+
+
+def test_residuals_turn_with_the_robot():
+    """An error of the model that is the same for the robot is the same at each heading."""
+    walks = shaking(1e-2), elsewhere(shaking(1e-2), (0.0, 0.0), 0.7)
+    found, there = (fit_grounding(BRIEF, SCENARIO, nominal(), x) for x in walks)
+    assert np.abs(there.residuals.state.velocity).max() > 1e-2
+    for a, b in zip(found.residuals.state[1:], there.residuals.state[1:], strict=True):
+        assert np.linalg.norm(a - b) < 0.1 * np.linalg.norm(b)  # 0.7 in the world's axes

@@ -9,15 +9,10 @@ import pytest
 from model import ROBOT
 from pretend import call, instead, pretend_walk
 
-from hector_jax.control.controller import WalkConfig
-from hector_jax.control.reference import named_command
-from hector_jax.control.weights import nominal
+from hector_jax import Job, WalkConfig, hfs, named_command, nominal, walk
 from hector_jax.control.weights_file import save_weights
 from hector_jax.sim import diagnosis
 from hector_jax.sim.diagnosis import Record, fall_of, likeliest_cause, not_the_weights
-from hector_jax.sim.loop import Job
-from hector_jax.sim.walk import walk
-from hector_jax.sim.world import hfs
 
 CONFIG = WalkConfig()
 JOB = Job(nominal(), named_command("straight"), hfs(), 1.0)
@@ -77,7 +72,7 @@ def test_the_likeliest_cause_follows_from_what_came_before_the_fall(record, caus
     assert likeliest_cause(ROBOT, record).startswith(cause)
 
 
-def test_a_fall_in_the_start_up_is_that_of_the_walk():
+def test_a_fall_in_the_start_up_or_later_is_that_of_the_walk_with_the_cause_of_its_plant():
     heavy = JOB._replace(imperfections=hfs()._replace(mass=np.array(6.0)), seconds=0.05)
     walked, fall = walk(CONFIG, ROBOT, heavy), fall_of(CONFIG, ROBOT, heavy)
     assert walked.fallen.all()
@@ -86,9 +81,6 @@ def test_a_fall_in_the_start_up_is_that_of_the_walk():
     assert fall.height < ROBOT.description.min_height
     assert "sinks steadily" in fall.cause
     assert fall_of(CONFIG, ROBOT, JOB._replace(seconds=0.05)) is None
-
-
-def test_a_fall_of_a_walk_has_the_cause_of_its_plant():
     icy = hfs()._replace(floor_friction=np.array(0.22))
     job = JOB._replace(command=named_command("s"), imperfections=icy, seconds=2.0)
     fall = fall_of(CONFIG, ROBOT, job)

@@ -8,19 +8,14 @@ import numpy as np
 import pytest
 from model import ANCHOR, ROBOT, vector
 
-from hector_jax.control.controller import WalkConfig
-from hector_jax.control.footstep import FootstepConfig
-from hector_jax.control.mpc import MpcConfig
+from hector_jax import InputError, RolloutConfig, Scenario, Wrench, last_command
+from hector_jax.control import FootstepConfig, MpcConfig, WalkConfig
 from hector_jax.control.parameters import bounds
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import directions, expert, nominal, vector_to_weights
-from hector_jax.core.inputs import InputError
-from hector_jax.core.trajectory import Wrench
-from hector_jax.grfm.effect import last_command
 from hector_jax.tuning.difftune import TuneConfig, descend, init, trial_weights, tune, update
 from hector_jax.tuning.evaluate import Evaluation, Objective, aligned
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
-from hector_jax.tuning.rollout import RolloutConfig, Scenario
 from hector_jax.tuning.status import Stop
 
 
@@ -84,8 +79,6 @@ def test_a_step_out_of_the_box_ends_exactly_on_its_wall(side, rule):
     np.testing.assert_array_equal(vector(stepped_once(huge, config, near)), vector(edge))
 
 
-# The loop, on a quadratic in log-weights whose optimum is known
-
 OPTIMUM = vector(nominal()) * np.exp(
     np.r_[np.linspace(-0.7, 0.9, 12), np.tile([0.3, -0.5, 0.8], 2), np.tile([0.2, 0.6, -0.4], 2)]
 )
@@ -107,12 +100,6 @@ def tune_toy(toy, config=TuneConfig(ridge=0.0), start=None, **more):  # noqa: B0
     return descend(config, nominal() if start is None else start, toy, **more)
 
 
-def test_a_quadratic_is_tuned_to_its_optimum_in_a_few_steps():
-    found = tune_toy(quadratic())
-    np.testing.assert_allclose(vector(found.weights), OPTIMUM, rtol=1e-6)
-    assert float(found.iterations[4].evaluation.loss) < 1e-6
-
-
 @pytest.mark.parametrize("rule", ["relative", "literal"])
 def test_the_papers_ten_steps_are_taken_uphill_too(rule):
     start = vector_to_weights(jnp.asarray(OPTIMUM * 1.01))
@@ -124,9 +111,11 @@ def test_the_papers_ten_steps_are_taken_uphill_too(rule):
     assert (np.diff(losses) > 0).any()
 
 
-def test_a_ridge_keeps_the_optimum_nearer_to_the_start_as_its_formula_has_it():
-    """Of L / L(0) + ridge / 2 |z|^2 with L = 1e6 |z_feet - z*|^2."""
-    ridge = 0.5
+def test_a_quadratic_is_tuned_to_its_optimum_and_with_a_ridge_to_that_of_its_formula():
+    found = tune_toy(quadratic())
+    np.testing.assert_allclose(vector(found.weights), OPTIMUM, rtol=1e-6)
+    assert float(found.iterations[4].evaluation.loss) < 1e-6
+    ridge = 0.5  # of L / L(0) + ridge / 2 |z|^2 with L = 1e6 |z_feet - z*|^2
     found = tune_toy(quadratic(), TuneConfig(ridge=ridge, iterations=30))
     aim = np.log(OPTIMUM / vector(nominal()))
     precision = 2 * directions() @ directions().T / (aim @ aim) + ridge * np.eye(18)
@@ -162,13 +151,6 @@ def test_a_short_step_that_gains_little_is_no_convergence():
     assert float(found.loss) < 1e-3 * float(found.iterations[0].evaluation.loss)
 
 
-def test_a_start_outside_the_box_is_refused():
-    start = nominal()
-    start.Q.position[1] = 1e5
-    with pytest.raises(InputError, match=r"Q_y is 100000; a tuning starts from weights of 0.01"):
-        tune_toy(quadratic(), start=start)
-
-
 def test_after_a_fall_a_shorter_step_leaves_from_the_last_accepted_weights():
     """It is no wrong prediction; see tests/test_faults.py too."""
     wall, seen = 1.12 * nominal().Q.velocity[2], []
@@ -195,7 +177,11 @@ def test_a_step_that_gains_less_than_a_hundredth_of_the_prediction_is_refused():
     np.testing.assert_array_equal(vector(found.weights), vector(nominal()))
 
 
-def test_a_start_whose_feet_differ_is_tied_and_stays_tied():
+def test_a_start_outside_the_box_is_refused_and_one_whose_feet_differ_is_tied_and_stays_tied():
+    start = nominal()
+    start.Q.position[1] = 1e5
+    with pytest.raises(InputError, match=r"Q_y is 100000; a tuning starts from weights of 0.01"):
+        tune_toy(quadratic(), start=start)
     start = nominal()._replace(R=Wrench(*(w * np.array([[2.0], [0.5]]) for w in nominal().R)))
     at = init(TuneConfig(), start).start
     np.testing.assert_allclose(vector(at), vector(nominal()), rtol=1e-12)
@@ -225,7 +211,7 @@ def test_ten_iterations_go_below_a_hundred_of_the_papers():
         assert float(with_ridge.loss) <= 0.8 * start, name
 
 
-def test_other_numbers_step_by_a_share_of_their_box_and_what_is_not_tuned_stays():
+def test_other_numbers_move_by_shares_of_their_box_by_either_rule_and_what_is_not_tuned_stays():
     config = TuneConfig(rule="relative", others=("turn_lead", "footstep_feedback"))
     start = nominal()._replace(others={"friction": 0.4})
     begun = {name: float(x) for name, x in init(config, start).start.others.items()}
@@ -241,9 +227,6 @@ def test_other_numbers_step_by_a_share_of_their_box_and_what_is_not_tuned_stays(
     assert moved.others["friction"] == 0.4
     far = stepped_once(gradient, replace(config, beta_others=10.0), start)
     assert far.others["turn_lead"] == 2.0
-
-
-def test_a_trust_region_holds_shares_of_boxes_as_it_holds_logs():
     config = TuneConfig(others=("turn_lead",))
     slope = random_tree(0, 0.0)._replace(others={"turn_lead": jnp.array(-100.0)})
     moved = stepped_once(slope, config)

@@ -23,14 +23,12 @@ import pytest
 from delay import AS_PROPOSED, BEFORE
 from pretend import python
 
+from hector_jax import load_robot, nominal, walk_config
 from hector_jax.cli import flags, parse
-from hector_jax.control.controller import walk_config
 from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.reference import COMMANDS, named_command
-from hector_jax.control.weights import nominal
 from hector_jax.control.weights_file import best
 from hector_jax.core.tree_file import tree_hash
-from hector_jax.robot.model import load_robot
 from hector_jax.sim.margin import delay_lines
 from hector_jax.store.nets import CollectConfig
 from hector_jax.walk_tuning import best_set
@@ -43,11 +41,8 @@ README, RESULTS, LIMITS = ROOT / "README.md", DOCS / "results.md", DOCS / "limit
 PAGES = sorted(p for p in DOCS.rglob("*.md") if not {"_build", "reference"} & set(p.parts))
 READ = [README, ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md", *PAGES]
 
-# Examples and names
-
 
 def blocks(text, language=""):
-    """Fenced blocks of a page."""
     fenced = re.findall(r"^```(.*)\n((?:.*\n)*?)```$", text, re.MULTILINE)
     return [block for kind, block in fenced if kind == language]
 
@@ -114,8 +109,6 @@ def test_commands_of_a_page_parse_and_what_it_names_is_there(path, capsys):
         tests = (ROOT / "tests" / f"{name}.py").read_text()
         assert f"def {test}" + ("" if more or not test else "(") in tests, (name, test)
 
-
-# Flags, sections, files and names, wherever they are told
 
 PACKAGE = ROOT / "hector_jax"
 FOREIGN = {"help", "help-all", "no-NAME", "tyro-print-completion"}
@@ -272,9 +265,6 @@ def test_pages_keep_their_budgets():
     assert not re.search(r"\bseeds?\b|\[-?\d+, -?\d+\]", readme)
 
 
-# Figures: each function yields a page and what it must say
-
-
 def report(name):
     return json.loads((REPORTS / name).read_text())
 
@@ -316,7 +306,6 @@ def interval(change, sign=""):
 
 
 def tracking():
-    """Errors in walks."""
     assert sum(one["falls"] for t in COMMANDS for one in sets(t).values()) == 0
     (count,) = {len(one["seeds"]) for t in COMMANDS for one in sets(t).values()}
     assert [float(named_command(t).velocity[0, 0]) for t in COMMANDS] == [0.5, 0.25, 0.5]
@@ -339,7 +328,6 @@ def tracking():
 
 
 def losses():
-    """Changes of the loss, of weights and of the numbers beside them."""
     for name, base in itertools.product(("without", "with", "best"), ("nominal", "expert")):
         changes = [sets(t)[name]["change"][base] for t in COMMANDS]
         assert all(change["counts"] for change in changes)
@@ -359,7 +347,6 @@ def losses():
 
 
 def changes_of_the_command():
-    """Smoothness, and legs that touch."""
     for name in ("nominal", "without", "with", "best"):
         cells = [f"{x:.1f} times, {y:{'+' * bool(y)}} %" for x, y in smoothness(name)]
         yield RESULTS, row(f"`{name}`", *cells)
@@ -384,7 +371,6 @@ DISTURBANCES = {
 
 
 def disturbances():
-    """Falls under disturbances."""
     result = report("robustness/robustness.json")
     assert result["weights"]["best"] == tree_hash(best())
     assert result["totals"]["best"]["falls_more"] == []
@@ -392,7 +378,6 @@ def disturbances():
     yield RESULTS, f"Of {len(result['cells'])} kinds of scenes"
 
     def count(pattern):
-        """Walks, and falls of nominal and of best."""
         chosen = [one for name, one in scenes.items() if re.fullmatch(pattern, name)]
         falls = [sum(one[name]["falls"] for one in chosen) for name in ("nominal", "best")]
         return sum(one["best"]["walks"] for one in chosen), *falls
@@ -412,12 +397,9 @@ def disturbances():
 
 
 def race():
-    """Few walks, and other methods."""
     methods = report("race/nominal/race.json")["s"].items()
-    at = {
-        name: {walks: np.median(losses) / 1e6 for walks, losses in one["own"].items()}
-        for name, one in methods
-    }
+    median = lambda own: {walks: np.median(losses) / 1e6 for walks, losses in own.items()}  # noqa: E731
+    at = {name: median(one["own"]) for name, one in methods}
     ours, bayes = at.pop("tuner"), at["nominal turbo on model"]["200"]
     evolution = min(at[name]["200"] for name in ("nominal cma-es", "nominal lq-cma-es"))
     rival = min(one["200"] for one in at.values())
@@ -431,10 +413,8 @@ def race():
     yield README, f"| CMA-ES (better of plain and lq-CMA-ES) | 200: {evolution:.2f} |"
     best_walks = best_set.SETS * best_set.PLANTS + 3 * START_PLANTS  # one is not anew
     yield README, f"| `hector tune --walks` | 5: {ours['5']:.2f} |"
-    yield (
-        README,
-        f"| `hector tune` | {CollectConfig().walks} once, for the network, then {best_walks};",
-    )
+    once = f"{CollectConfig().walks} once, for the network"
+    yield README, f"| `hector tune` | {once}, then {best_walks};"
 
 
 ROBOTS = {"quadruped": "`examples/quadruped`", "go2": "Unitree Go2"}
@@ -446,7 +426,6 @@ NAMES = ("best", "nominal")
 
 
 def robots():
-    """Other robots, each tuned for all three trajectories."""
     results = report("robots/robots.json")
 
     def walked(runs):
@@ -482,7 +461,6 @@ def robots():
 
 
 def published_robots():
-    """Robots tuned for straight alone."""
     told, fell, changes_on_straight = [], set(), {}
     all_numbers = report("robots/robots.json")["all numbers"]
     for robot, name in PUBLISHED.items():
@@ -518,7 +496,6 @@ def published_robots():
 
 
 def engines():
-    """The verdict in other engines."""
     result = report("verdict/verdict.json")
     assert result["config"]["flags"]["engine"] == ["c", "drake", "pinocchio"]
     of, falls = result["sets"]["best"], {n: one["falls"] for n, one in result["sets"].items()}
@@ -622,9 +599,6 @@ def test_each_number_of_readme_results_and_limits_is_that_of_its_file():
     for page in (RESULTS, LIMITS):
         rest = re.sub(r"\]\([^)]*\)|`[^`]*`|\b[GH][o0-9]2?\b", "", left[page])
         assert re.findall(r"\S*\d\S*", rest) == [], page.name  # numbers that no file is behind
-
-
-# The site, notebooks and the example
 
 
 @pytest.mark.slow

@@ -39,7 +39,6 @@ ELSEWHERE = ("--cluster", "--help", "doctor")  # a scheduler; no work; the machi
 
 
 def words_of(line):
-    """The words of a line as they are run here."""
     first, *words = shlex.split(line, comments=True)[1:]
     if first == "tune":  # each of them is made short
         words = " ".join(words).replace("--traj all", "--traj straight c s").split()

@@ -1,23 +1,30 @@
-"""Weight sets in several engines and models: the counts, what is claimed of them, the command."""
+"""Weight sets in engines and models, and finished runs side by side: counts, claims, commands."""
 
 import json
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pretend import call, instead, pretend_score, pretend_walk
+from pretend import call, instead, pretend_history, pretend_score, pretend_walk, refused
 
+from hector_jax import PAPER_LOSS, InputError, expert, nominal
 from hector_jax.cli import evaluate as command
-from hector_jax.control.weights import expert, nominal
+from hector_jax.cli.flags import Tune
+from hector_jax.cli.parse import as_table
 from hector_jax.control.weights_file import save_weights
-from hector_jax.core.inputs import InputError
+from hector_jax.core.files import write_json
+from hector_jax.core.journal import write_rows
 from hector_jax.report import matrix as report
+from hector_jax.report.compare import compare_runs
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.standin import even, standin
-from hector_jax.tuning.loss import PAPER_LOSS
+from hector_jax.store.run import Run, as_row
 from hector_jax.verdict import judging, matrix
 from hector_jax.verdict.matrix import Column
 from hector_jax.verdict.metrics import make_verdict
+from hector_jax.verdict.stopping import StoppingRule
 
 C, DRAKE, HEAVY = Column("c", "own"), Column("drake", "own"), Column("c", "heavy")
 SETS = ("nominal", "expert", "with")
@@ -36,30 +43,19 @@ def cell(seeds=8, fallen=(), nominal=4e6, tuned=1e6):
 def test_cells_below_and_clear_and_void_are_counted():
     mixed = cell()
     mixed.scores["with"].losses["L"][:3] *= 8.0  # the median stays below, the interval does not
-    cells = {
-        (C, "s"): cell(),
-        (C, "c"): mixed,
-        (HEAVY, "s"): cell(fallen=[("with", 1)]),
-        (HEAVY, "c"): cell(tuned=5e6),
-    }
+    cells = {(C, "s"): cell(), (C, "c"): mixed, (HEAVY, "s"): cell(fallen=[("with", 1)])}
+    cells[HEAVY, "c"] = cell(tuned=5e6)
     assert matrix.tally(cells, "with", "nominal") == (4, 2, 1, 1, 1)
 
 
-def test_intervals_of_falls_are_exact():
+def test_plants_are_the_sample_of_falls_over_engines_and_trajectories_and_intervals_are_exact():
     none, one = matrix.fall_share(0, 32), matrix.fall_share(1, 8)
-    assert none.low == 0.0
-    assert none.high == pytest.approx(1.0 - 0.025 ** (1 / 32))
+    assert (none.low, none.high) == (0.0, pytest.approx(1.0 - 0.025 ** (1 / 32)))
     # P(X >= 1 | low) = P(X <= 1 | high) = 2.5 %
     assert 1.0 - (1.0 - one.low) ** 8 == pytest.approx(0.025)
     assert (1 - one.high) ** 8 + 8 * one.high * (1 - one.high) ** 7 == pytest.approx(0.025)
-
-
-def test_plants_are_the_sample_of_falls_over_engines_and_trajectories():
-    cells = {
-        (column, trajectory): cell(seeds, [("with", 0)])
-        for column, seeds in ((C, 8), (DRAKE, 4))
-        for trajectory in ("straight", "s")
-    }
+    cells = {(C, trajectory): cell(8, [("with", 0)]) for trajectory in ("straight", "s")}
+    cells |= {(DRAKE, trajectory): cell(4, [("with", 0)]) for trajectory in ("straight", "s")}
     assert matrix.falls(cells, "with") == (4, 24, 1, 8, matrix.fall_share(1, 8))
     cells[HEAVY, "s"] = cell(8, [("with", 0), ("with", 5)])
     assert matrix.falls(cells, "with") == (6, 32, 2, 8, matrix.fall_share(2, 8))
@@ -186,3 +182,146 @@ def test_a_named_set_is_not_a_folder_of_that_name(monkeypatch, tmp_path, capsys,
     assert call(monkeypatch, "evaluate", "--traj", "s", "--seeds", 1, "--weights", "nominal") == 0
     assert [float(job.weights.Q.euler[0]) for _, job in walked.jobs] == [nominal().Q.euler[0]]
     assert capsys.readouterr().out.startswith("s, 1 plant on the hardware stand-in\n")
+
+
+def verdict(L, falls=0, **changes):
+    part = {"mean": L, "low": 0.9 * L, "high": 1.1 * L}
+    each = {
+        name: {"median": x, "low": x - 3, "high": x + 3, "wins": 1.0, "counts": True, "parts": {}}
+        for name, x in changes.items()
+    }
+    found = {"L": part, "L_ctrl": part, "falls": falls, "seeds": [0, 1], "scenes": ["c", "s"]}
+    return {"standin": found | {"change": each}}
+
+
+def run_folder(folder, flags, versions, weight=1e5):
+    sets = {"nominal": verdict(2e6), "expert": verdict(1.5e6, nominal=-25.0)}
+    sets["with"] = verdict(1e6, falls=1, nominal=-50.0, expert=-33.3)
+    config = {"flags": as_table(flags), "tune": {"loss": {"euler": weight}}}
+    write_json(folder / "result.json", {"alpha": {}, "sets": sets})
+    write_json(folder / "config.json", config)
+    write_json(folder / "versions.json", {"jax": "1"} | versions)
+    rows = [as_row("with", iteration) for iteration in pretend_history(2, refused=(1,))]
+    write_rows(folder / "metrics.jsonl", rows)
+    return folder
+
+
+@pytest.fixture
+def runs(tmp_path):
+    one = run_folder(tmp_path / "one", Tune(), {"seconds": "150", "commit": "aaa"})
+    return [one, run_folder(tmp_path / "two", Tune(traj=("c",), seeds=32), {})]
+
+
+def test_a_comparison_tells_losses_falls_iterations_and_what_differs(monkeypatch, capsys, runs):
+    assert call(monkeypatch, "evaluate", "--runs", *runs, "--json") == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    told = json.loads(out)  # and nothing else
+    one, two = told["runs"]
+    assert (one["run"], one["seconds"], two["seconds"]) == (str(runs[0]), 150.0, None)
+    assert one["sets"]["with"]["change"]["expert"]["median"] == -33.3
+    assert [one["sets"]["with"][key] for key in ("falls", "seeds", "walks")] == [1, 2, 4]
+    assert one["tuning"] == {"with": {"iterations": 2, "refused": 1}}
+    settings = {"flags.traj": [["straight"], ["c"]], "flags.seeds": [8, 32]}
+    assert told["differ"] == {"settings": settings, "versions": {"commit": ["aaa", None]}}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "fault"),
+    [
+        ("result.json", None, "cannot read a file of a run of `hector tune`: No such file"),
+        ("result.json", '{"sets": {"with": {"hfs": {}}}}', "set with has no verdict"),
+        ("metrics.jsonl", "{}\n", "metrics.jsonl, line 1: a row"),
+    ],
+)
+def test_what_is_no_finished_run_is_told_by_its_file(runs, name, text, fault):
+    (runs[0] / name).unlink()
+    if text is not None:
+        (runs[0] / name).write_text(text)
+    with pytest.raises(ValueError, match=fault) as told:
+        compare_runs([Run(folder) for folder in runs])
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(("weight", "said"), [(1e5, 0), (2e5, 1)])
+def test_runs_of_different_losses_are_said_to_be_so(monkeypatch, capsys, tmp_path, weight, said):
+    two = run_folder(tmp_path / "two", Tune(alpha="auto", seeds=32), {}, weight)
+    runs = run_folder(tmp_path / "one", Tune(), {}), two
+    assert call(monkeypatch, "evaluate", "--runs", *runs) == 0
+    assert capsys.readouterr().out.count("losses differ") == said
+
+
+def test_plants_stop_to_walk_when_every_set_is_clear_and_go_on_later(
+    monkeypatch, tmp_path, capsys, walked
+):
+    words = "evaluate", "--traj", "s", "--seeds", 32, "--processes", 5, "--out", tmp_path
+    assert call(monkeypatch, *words, "--until-clear") == 0
+    assert [job.seed for _, job in walked.jobs] == [seed for seed in range(6) for _ in range(2)]
+    told, err = capsys.readouterr()
+    line = "MuJoCo C, after 6 of at most 32 plants, against nominal: expert worse. "
+    line += "Saved 52 of 64 walks."
+    assert told.splitlines()[-1] == line
+    assert "at most 64 walks: 2 on each plant" in err
+    page = (tmp_path / "report.md").read_text()
+    assert f"- {line}\n" in page
+    assert "The walks decided how many plants walked" in page
+    (stop,) = json.loads((tmp_path / "verdict.json").read_text())["stopping"]
+    assert stop == {
+        **C._asdict(),
+        "plants": 6,
+        "most_plants": 32,
+        "walks": 12,
+        "walks_saved": 52,
+        "claims": {"s": {"expert": "worse"}},
+    }
+    assert call(monkeypatch, *words) == 0
+    assert len(walked.jobs) == 64
+    assert "of at most" not in capsys.readouterr().out
+    assert call(monkeypatch, *words, "--until-clear") == 0  # whatever walked before
+    assert capsys.readouterr().out == told
+    assert len(walked.jobs) == 64
+
+
+def test_each_engine_and_model_stops_where_it_is_clear(monkeypatch, capsys, walked):
+    words = "evaluate", "--traj", "s", "c", "--plant", "heavy", "--other-seeds", 16, "--json"
+    assert call(monkeypatch, *words, "--seeds", 12, "--until-clear") == 0
+    result = json.loads(capsys.readouterr().out)
+    fewest = StoppingRule(claims=4).fewest
+    assert [len(one["seeds"]) for one in result["columns"]] == [fewest, fewest]
+    saved = [one["walks_saved"] for one in result["stopping"]]
+    assert saved == [4 * (12 - fewest), 4 * (16 - fewest)]
+    assert len(result["claims"][1].split("; on c expert ")) == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--seeds", 5), "needs 6 plants or more for 1 claim, got 5 in MuJoCo C"),
+        (("--world", "hfs"), "needs 6 plants or more for 1 claim, got 1 in MuJoCo C"),
+        (
+            ("--plant", "heavy", "--other-seeds", 6),
+            "8 plants or more for 2 claims, got 6 in MuJoCo",
+        ),
+        (("--weights", "expert", "mine=best"), "--weights must be nominal, which changes are"),
+    ],
+)
+def test_what_can_never_be_clear_is_refused_before_a_walk(
+    monkeypatch, capsys, walked, words, expected
+):
+    assert expected in refused(monkeypatch, capsys, "evaluate", "--until-clear", *words)
+    assert not walked.jobs
+
+
+@pytest.mark.slow
+def test_two_evaluations_at_once_in_one_folder_walk_each_case_once(tmp_path):
+    line = "evaluate --traj straight --seeds 3 --seconds 0.1 --json --out both".split()
+    words = [sys.executable, "-m", "hector_jax", *line]
+    options = {"cwd": tmp_path, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    running = [subprocess.Popen(words, text=True, **options) for _ in range(2)]
+    one, other = (json.loads(program.communicate()[0]) for program in running)
+    assert one["columns"] == other["columns"]
+    rows = [json.loads(line) for line in (tmp_path / "both/walks.jsonl").read_text().splitlines()]
+    assert len({(row["set"], row["seed"]) for row in rows}) == len(rows) == 6
+    assert {(row["engine"], row["world"], row["model"]) for row in rows} == {
+        ("c", "standin", "own")
+    }

@@ -52,13 +52,14 @@ from hector_jax.export.check import (
     compile_controller,
     inputs_of,
 )
-from hector_jax.export.export import SCHEMA, controller_of_run, find_weights, weights_cpp
+from hector_jax.export.export import SCHEMA, weights_cpp
 from hector_jax.export.template import fill_template
 from hector_jax.qp import QP, Status, solve_qp
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import ideal
 from hector_jax.store.cache import robot_hash
+from hector_jax.store.run import Run
 
 pytestmark = pytest.mark.usefixtures("on_cpu")
 HERE = Path(__file__).parent
@@ -600,19 +601,14 @@ def test_a_run_is_exported_with_its_own_controller(run):
     kept = to_table(own)
     del kept["mpc"]["effort_reference"]  # of a run from before there was such a setting
     (run / "config.json").write_text(json.dumps({"tune": {"rollout": {"walk": kept}}}))
-    assert find_weights(run, "best") == run / "weights" / "best.json"
-    assert controller_of_run(run) == own
-    path = run / "weights" / "best.json"
-    assert find_weights(path, "best") == path
+    assert Run(run).weights_file("best") == run / "weights" / "best.json"
+    assert Run(run).controller == own
 
 
 def test_a_set_that_is_not_there_is_one_line_and_writes_nothing(monkeypatch, capsys, run):
     line = refused(monkeypatch, capsys, "export", run, "--set", "bset")
     assert "did you mean 'best'" in line
     assert not (run / "export").exists()
-
-
-# A template
 
 
 def filled(folder, text):

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from model import ROBOT, small_effect
 
+from hector_jax import InputError, RolloutConfig, Scenario
 from hector_jax.control.parameters import bounds
 from hector_jax.control.reference import Command, standing_anchor
 from hector_jax.control.weights import nominal, weights_to_vector
-from hector_jax.core.inputs import InputError
 from hector_jax.tuning import difftune, rollout
 from hector_jax.tuning.difftune import TuneConfig, descend
 from hector_jax.tuning.evaluate import Evaluation, Objective
-from hector_jax.tuning.rollout import RolloutConfig, Scenario
 from hector_jax.tuning.status import Stop
 
 pytestmark = pytest.mark.usefixtures("on_cpu")
@@ -37,13 +36,9 @@ class Fault(IntEnum):
     FLAT = 5
 
 
-REASONS = {
-    Fault.STATE: "loss or gradient not finite",
-    Fault.GRADIENT: "loss or gradient not finite",
-    Fault.QP: "QP residual inf too large",
-    Fault.FALL: "the robot fell",
-    Fault.FLAT: "QP residual inf too large",
-}
+REASONS = dict.fromkeys((Fault.STATE, Fault.GRADIENT), "loss or gradient not finite")
+REASONS |= dict.fromkeys((Fault.QP, Fault.FLAT), "QP residual inf too large")
+REASONS |= {Fault.FALL: "the robot fell"}
 
 
 def told(fault=Fault.NONE, reach=0.0):
@@ -162,8 +157,6 @@ def test_a_start_that_cannot_be_believed_ends_the_run():
     with pytest.raises(InputError, match=f"{words} the robot fell"):
         tune(told(), robot=crouched)
 
-
-# Numbers that no rollout gives
 
 NUMBERS = [np.nan, np.inf, -np.inf, 1.7e308, -1.7e308, 1e-308, 5e-324, 0.0]
 

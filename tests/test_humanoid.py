@@ -1,46 +1,44 @@
-"""Example robots: their models, flat feet, gradients, both engines, export."""
+"""Other robots: their models, flat feet, gradients, both engines, export, tuning."""
 
+import json
+from dataclasses import replace
 from itertools import product
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from model import EXAMPLES, QUADRUPED
+from pretend import call
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 from test_rollout import OBLIQUE, check_gradient
 
+from hector_jax import Job, RolloutConfig, Scenario, hfs, ideal, last_command, load_robot, walk
+from hector_jax.control import expert, named_command, nominal, standing_anchor, walk_config
 from hector_jax.control.contact import CORNER_FRICTION, FLAT_FOOT, Contact, rows
-from hector_jax.control.controller import walk_config
-from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.weights import nominal
+from hector_jax.control.controller import WalkConfig
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.export.check import compare_with_live, compile_controller, compiler, record
 from hector_jax.export.source import controller_source
 from hector_jax.grfm.dataset import at_interval
-from hector_jax.grfm.effect import last_command
 from hector_jax.importing.remarks import differences
-from hector_jax.robot.model import load_robot
-from hector_jax.sim.loop import Job
+from hector_jax.robot.description import Description
 from hector_jax.sim.parallel import walk_batch
-from hector_jax.sim.walk import walk
-from hector_jax.sim.world import hfs, ideal
-from hector_jax.tuning.rollout import RolloutConfig, Scenario
+from hector_jax.store import nets
+from hector_jax.store.collection import load_walks
+from hector_jax.store.nets import CollectConfig
+from hector_jax.store.run import Run
 
 ROBOT = load_robot(EXAMPLES / "humanoid" / "robot.toml")
 CONFIG = walk_config(ROBOT)
 MU, MOST = 0.6, 800.0
+FILES = [("humanoid/robot.toml", 35.0, 0.647), ("hector-v2/robot.toml", 11.468, 0.417)]
+FILES += [("hector-v2/arms.toml", 14.848, 0.478)]
 
 
-@pytest.mark.parametrize(
-    ("file", "mass", "com_height"),
-    [
-        ("humanoid/robot.toml", 35.0, 0.647),
-        ("hector-v2/robot.toml", 11.468, 0.417),
-        ("hector-v2/arms.toml", 14.848, 0.478),
-    ],
-)
+@pytest.mark.parametrize(("file", "mass", "com_height"), FILES)
 def test_a_model_weighs_what_its_source_says_and_is_its_own_mirror_image(file, mass, com_height):
     robot = load_robot(EXAMPLES / file)
     assert robot.mass == pytest.approx(mass, abs=1e-3)
@@ -185,3 +183,57 @@ def test_the_humanoid_walks_twelve_seconds_in_hfs():
         if turn:
             turned = found.state.euler[-1, 2] - found.initial.euler[2]
             assert turned == pytest.approx(6.0, abs=0.5)
+
+
+STRIDER = EXAMPLES / "strider" / "robot.toml"
+
+
+@pytest.fixture(scope="module")
+def strider():
+    return load_robot(STRIDER)
+
+
+def test_the_description_of_hector_says_what_the_code_takes_by_default():
+    robot = load_robot()
+    assert replace(robot.description, control=(), nominal=None, expert=None) == Description()
+    assert walk_config(robot) == WalkConfig()
+    assert repr(walk_config(robot)) == repr(WalkConfig())  # by which walks are known
+    for of_robot, default in ((nominal(robot), nominal()), (expert(robot), expert())):
+        jax.tree.map(np.testing.assert_array_equal, of_robot, default)
+
+
+@pytest.mark.slow
+def test_strider_walks_five_metres_untuned(strider):
+    for world in (ideal, hfs):
+        job = Job(nominal(strider), named_command("straight"), world(), 10.5)
+        found = walk(walk_config(strider), strider, job)
+        assert not found.fallen.any(), world
+        assert not found.legs_touch.any(), world
+        ahead, aside, up = found.state.position[-1] - found.initial.position
+        assert ahead > 5.0, world
+        assert max(abs(aside) / 5, abs(up)) < 0.1, world
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_strider_is_tuned_by_the_same_command_and_a_run_knows_it(monkeypatch, strider, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    small = CollectConfig(walks=6, seconds=1.0)
+    monkeypatch.setattr(nets, "CollectConfig", lambda: small)
+    Path("ahead.toml").write_text('name = "ahead"\n[[segment]]\nseconds = 1.5\nv_x = 0.3\n')
+    flags = ("--traj", "ahead.toml", "--seeds", "1", "--iterations", "4", "--no-video")
+    few = ("--walk-plants", "1", "--processes", "1")
+    assert call(monkeypatch, "tune", "--robot", STRIDER, *flags, *few) == 0
+    assert len(load_walks(tmp_path / "data" / "strider" / "walks", strider).job.seed) == 6
+    assert (tmp_path / "data" / "strider" / "grfm.npz").exists()
+    with pytest.raises(ValueError, match="made for another robot"):
+        load_walks(tmp_path / "data" / "strider" / "walks", load_robot())
+    (run,) = (tmp_path / "runs" / "strider" / "ahead").iterdir()
+    assert Run(run).weights_file("with") == run / "weights" / "with.json"
+    assert Run(run).controller == walk_config(strider)
+    assert Run(run).request.robot == STRIDER
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    for name in ("without", "with"):
+        L = [line["L"] for line in lines if line["set"] == name and line["accepted"]]
+        assert L[-1] < 0.95 * L[0]
+    assert json.loads((run / "result.json").read_text())["sets"]["with"]["hfs"]["falls"] == 0

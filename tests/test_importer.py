@@ -11,8 +11,7 @@ from model import EXAMPLES
 from pretend import call
 from published import JOINTS, replaced, small
 
-from hector_jax.control.controller import walk_config
-from hector_jax.core.inputs import InputError
+from hector_jax import InputError, walk_config
 from hector_jax.core.settings import as_toml
 from hector_jax.importing.propose import HEIGHT, MASS, propose_robot
 from hector_jax.importing.remarks import remarks
@@ -30,7 +29,6 @@ HUMANOID, QUADRUPED = (EXAMPLES / x / f"{x}.xml" for x in ("humanoid", "quadrupe
 
 
 def edited(folder, *changes, **parts):
-    """The small biped with some of its text replaced."""
     path = small(folder, **parts).model
     path.write_text(replaced(path.read_text(), *changes))
     return path
@@ -95,8 +93,6 @@ def test_the_compiler_of_a_urdf_counts(tmp_path):
         assert words in propose_robot(path).error
 
 
-# What is refused, and what is told
-
 MOTORS = "<actuator>.*</actuator>"
 REFUSED = [  # what is told, and changes of the small biped
     ("'torso' push bodies", ('name="torso"', 'name="torso" gravcomp="1"')),
@@ -159,9 +155,6 @@ def test_what_is_likely_wrong_is_told(tmp_path, kind):
         assert re.search(r"left_ankle, right_ankle .* 30 / 20 ", "\n".join(table_of(robot)))
 
 
-# Legs as mirror images
-
-
 def test_a_hinge_is_a_line_and_has_no_sign(tmp_path):
     """Knee, ankle and hip of the right leg are moved along their own axes."""
     own = propose_robot(edited(tmp_path))
@@ -197,9 +190,6 @@ def test_knees_bend_from_the_straight_leg(tmp_path):
     assert proposal.robot.standing_height == pytest.approx(own.robot.standing_height, abs=1e-3)
 
 
-# A proposal is never nothing
-
-
 def test_a_draft_has_what_was_found_and_what_is_to_be_mended(monkeypatch, capsys, tmp_path):
     unlike = ('(?s)(right_foot.*?)size="0.06 0.03 0.01"', r'\1size="0.09 0.03 0.01"')
     proposal = propose_robot(edited(tmp_path, unlike))
@@ -214,7 +204,9 @@ def test_a_draft_has_what_was_found_and_what_is_to_be_mended(monkeypatch, capsys
     assert tomllib.loads(printed[printed.index("# Proposed") :])["model"] == "arm.xml"
 
 
-def test_what_a_file_by_hand_leaves_out_is_filled_in_by_the_rules(monkeypatch, capsys, tmp_path):
+def test_what_a_file_names_is_checked_and_taken_and_the_rest_is_filled_in(
+    monkeypatch, capsys, tmp_path
+):
     model = edited(tmp_path)
     full = propose_robot(model).table
     path = tmp_path / "own.toml"
@@ -229,11 +221,6 @@ def test_what_a_file_by_hand_leaves_out_is_filled_in_by_the_rules(monkeypatch, c
     assert not {"gait", "gait.stance", "model"} & set(proposal.filled)
     assert call(monkeypatch, "robot", path) == 0
     assert "left out " in capsys.readouterr().out
-
-
-def test_legs_that_a_file_names_are_checked_and_taken(tmp_path):
-    """Without their ankles the legs have another number of joints, which no rule finds."""
-    model, path = edited(tmp_path), tmp_path / "own.toml"
 
     def named(joints):
         path.write_text(f'model = "{model.name}"\n[joints]\n{joints}\n')
@@ -325,7 +312,9 @@ def test_soles_of_meshes_are_asked_for(monkeypatch, capsys, tmp_path):
     assert read_description(out).model == tmp_path / "robot-standard.xml"
 
 
-def test_wrenches_act_in_the_middle_of_a_sole_with_a_short_heel(tmp_path):
+def test_wrenches_act_in_the_middle_of_a_sole_which_may_be_a_tilted_box(
+    tmp_path,
+):
     proposal = propose_robot(edited(tmp_path, ('pos="0.01 0 -0.03"', 'pos="0.05 0 -0.03"')))
     assert proposal.wrong == ()
     assert "point" not in proposal.table["feet"]["left"]
@@ -336,9 +325,6 @@ def test_wrenches_act_in_the_middle_of_a_sole_with_a_short_heel(tmp_path):
     ankles = [data.joint(f"{side}_ankle").xanchor[0] for side in ("left", "right")]
     assert abs(data.subtree_com[1][0] - np.mean(ankles)) < 1e-3
     assert not any("along -x" in line for line in remarks(robot))
-
-
-def test_a_tilted_box_is_the_sole_and_is_level_standing(tmp_path):
     path = edited(tmp_path, (CAP, ""), (BOX, BOX.replace("/>", ' euler="0 0.2 0"/>')))
     for sole in find_soles(survey_file(path)):
         np.testing.assert_allclose(sole.axes[:, 2], [np.sin(0.2), 0.0, np.cos(0.2)], atol=1e-9)
@@ -373,7 +359,7 @@ def test_gains_follow_from_what_hangs_at_a_joint_and_sizes_scale_with_mass_and_h
     assert description.plants.push == description.plants.payload == pytest.approx(m, rel=6e-3)
 
 
-def test_the_command_prints_the_table_and_the_proposal(monkeypatch, capsys):
+def test_a_proposal_is_printed_and_written_once_beside_its_model(monkeypatch, capsys, tmp_path):
     assert call(monkeypatch, "robot", MODEL_PATH) == 0
     out = capsys.readouterr().out
     table, text = out.split("\n\n", 1)
@@ -384,9 +370,6 @@ def test_the_command_prints_the_table_and_the_proposal(monkeypatch, capsys):
     assert "mended   " in table
     assert "wrong    nothing" in table
     assert tomllib.loads(text)["joints"]["left"][0] == "left_hip_yaw"
-
-
-def test_a_proposal_is_written_once_and_beside_its_model(monkeypatch, capsys, tmp_path):
     model, out = edited(tmp_path), tmp_path / "other" / "robot.toml"
     assert call(monkeypatch, "robot", model, "--out", out) == 0
     assert out.read_text().startswith("# Proposed by `hector robot ")

@@ -16,26 +16,19 @@ from hypothesis import strategies as st
 from model import ROBOT
 from scenes import SceneConfig
 
+from hector_jax import QpConfig, RolloutConfig, TuneConfig, expert
 from hector_jax.cli.flags import Evaluate, Tune
 from hector_jax.cli.parse import from_file
-from hector_jax.control.controller import WalkConfig
-from hector_jax.control.footstep import FootstepConfig
-from hector_jax.control.gait import GaitConfig
-from hector_jax.control.legs import LegConfig
-from hector_jax.control.mpc import MpcConfig
+from hector_jax.control import FootstepConfig, GaitConfig, LegConfig, MpcConfig, WalkConfig
 from hector_jax.control.trajectories import load_command
-from hector_jax.control.weights import expert
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.tree_file import save_tree
 from hector_jax.grfm import network
 from hector_jax.grfm.training import TrainConfig
-from hector_jax.qp import QpConfig
 from hector_jax.report.video import VideoConfig
 from hector_jax.store import collection
 from hector_jax.store.nets import CollectConfig
-from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.rollout import RolloutConfig
 
 QUIET = {"database": None, "deadline": None, "suppress_health_check": list(HealthCheck)}
 hundreds = settings(max_examples=300, derandomize=True, **QUIET)
@@ -58,8 +51,6 @@ def one_line(error):
     assert len(message) < 1000, message
     return message
 
-
-# Settings
 
 CONFIGS = (GaitConfig, FootstepConfig, LegConfig, QpConfig, MpcConfig, WalkConfig, VideoConfig)
 CONFIGS += (RolloutConfig, TuneConfig, TrainConfig, CollectConfig, SceneConfig)
@@ -105,11 +96,7 @@ def test_settings_are_refused_by_field_and_value():
         assert any(short_repr(one) in message or repr(one)[:20] in message for one in parts)
 
 
-# One case a line: of each kind of fault one, for each loader
-
-
 def edited(part, entry, value):
-    """The text of a file of weights with another entry."""
     tree = {"Q": {}, "R": {"force": [[1e-4] * 3] * 2, "moment": [[1e-4] * 3] * 2}, "others": {}}
     tree["Q"] |= {n: [1.0, 2.0, 3.0] for n in ("euler", "position", "ang_velocity", "velocity")}
     tree[part][entry] = value
@@ -159,9 +146,6 @@ def test_a_wrong_file_is_one_line_with_file_field_and_value(tmp_path, name, text
     message = one_line(caught.value)
     assert str(tmp_path / name) in message
     assert fault in message
-
-
-# Files
 
 
 @pytest.fixture(scope="module")

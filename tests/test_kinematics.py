@@ -118,7 +118,7 @@ def random_joints(robot, spread=0.4):
         yield robot.standing_joints + rng.uniform(-spread, spread, len(robot.standing_joints))
 
 
-def test_feet_and_jacobians_are_those_of_mujoco(made):
+def test_feet_jacobians_and_the_weight_of_the_legs_under_a_tilted_trunk_are_those_of_mujoco(made):
     robot, model = made
     standing = posed(robot, model, robot.standing_joints)
     names = [foot.point for foot in robot.description.named_feet]
@@ -138,10 +138,6 @@ def test_feet_and_jacobians_are_those_of_mujoco(made):
             own = [model.joint(joint).dofadr[0] for joint in joints_]
             np.testing.assert_allclose(J_v[side], full_v[:, own], atol=1e-12)
             np.testing.assert_allclose(J_w[side], full_w[:, own], atol=1e-12)
-
-
-def test_the_weight_of_the_legs_under_a_tilted_trunk_is_that_of_mujoco(made):
-    robot, model = made
     rng = np.random.default_rng(2)
     for joints in random_joints(robot):
         tilt = Rotation.from_euler("xyz", rng.uniform(-0.8, 0.8, 3))
@@ -176,13 +172,12 @@ def test_joints_are_found_from_feet(made):
             np.testing.assert_allclose(found.rotation, wanted, atol=1e-9)
 
 
-def test_rates_along_a_path_are_the_derivative_of_the_joints(made):
+def test_rates_are_the_derivative_of_the_joints_and_all_is_finite_on_axes_and_out_of_reach(made):
     robot, _ = made
     start, legs = jnp.asarray(robot.standing_joints), len(robot.foot_point)
     position = poses(robot, start).position
-    up = jnp.tile(jnp.array([0.0, 0.0, 1.0]), (legs, 1))
+    up, yaw = jnp.tile(jnp.array([0.0, 0.0, 1.0]), (legs, 1)), jnp.zeros(legs)
     moved = jnp.tile(jnp.array([[0.3, 0.1, 0.2], [-0.2, 0.1, 0.3]]), (legs // 2, 1))
-    yaw = jnp.zeros(legs)
     at = jax.jit(lambda t: inverse_legs(robot, position + t * moved, yaw, up, start, steps=12))
     here, rates = jax.jvp(at, (jnp.asarray(0.05),), (jnp.asarray(1.0),))
     difference = (at(jnp.asarray(0.05 + 1e-5)) - at(jnp.asarray(0.05 - 1e-5))) / 2e-5
@@ -192,11 +187,6 @@ def test_rates_along_a_path_are_the_derivative_of_the_joints(made):
     speeds = np.einsum("lij,lj->li", J_v, rates.reshape(legs, -1))
     np.testing.assert_allclose(speeds, moved, atol=1e-6)
 
-
-def test_a_leg_and_its_derivatives_are_finite_on_axes_above_the_hip_and_out_of_reach(made):
-    robot, _ = made
-    start, legs = jnp.asarray(robot.standing_joints), len(robot.foot_point)
-    up, yaw = jnp.tile(jnp.array([0.0, 0.0, 1.0]), (legs, 1)), jnp.zeros(legs)
     axes = np.cumsum(robot.joint_origin, axis=1).swapaxes(0, 1)
     hip = axes[2]
     beside = hip + robot.joint_origin[:, 3:].sum(axis=1) * [0, 1, 0]  # in the plane of the leg
@@ -207,9 +197,6 @@ def test_a_leg_and_its_derivatives_are_finite_on_axes_above_the_hip_and_out_of_r
     for function in (find, jax.jacfwd(find), jax.jacrev(find)):
         found = jax.jit(jax.vmap(function))(jnp.asarray(np.stack(targets)))
         assert jnp.isfinite(found).all()
-
-
-# HECTOR's closed form
 
 
 HECTOR = load_robot()
@@ -226,7 +213,7 @@ def closed_form(robot, position, yaw, pitch):
 closed_form_jit = jax.jit(closed_form)
 
 
-def test_the_closed_form_finds_all_joints_within_their_limits():
+def test_the_closed_form_finds_joints_within_their_limits_and_points_at_what_is_out_of_reach():
     rng = np.random.default_rng(1)
     tried = 0
     for joints in rng.uniform(HECTOR.joint_lower, HECTOR.joint_upper, size=(40, 10)):
@@ -240,9 +227,6 @@ def test_the_closed_form_finds_all_joints_within_their_limits():
         tried += int(below.sum())
         np.testing.assert_allclose(back.reshape(2, 5)[below], legs[below], rtol=0, atol=1e-10)
     assert tried > 60
-
-
-def test_a_target_out_of_reach_is_pointed_at_with_the_knee_at_its_limit():
     far = np.array([[0.3, 0.2, -2.0], [-0.3, -0.2, -2.0]])
     joints = closed_form_jit(HECTOR, far, jnp.zeros(2), jnp.zeros(2))
     np.testing.assert_allclose(np.asarray(joints)[[3, 8]], HECTOR.joint_upper[[3, 8]], atol=1e-12)

@@ -9,16 +9,8 @@ import numpy as np
 import pytest
 from model import QUADRUPED, ROBOT, WEIGHT
 
+from hector_jax.control import LegConfig, Measurement, legs
 from hector_jax.control.footstep import Feet
-from hector_jax.control.legs import (
-    LegConfig,
-    Measurement,
-    joint_torques,
-    stance_torques,
-    swing_joints,
-    swing_path,
-    trunk_position,
-)
 from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.trajectory import State, Wrench
 from hector_jax.robot.checks import standing_data
@@ -29,25 +21,21 @@ CONFIG = LegConfig()
 SWING = 0.2
 STANDS = jnp.asarray(ROBOT.standing_joints)
 
-stance = jax.jit(lambda state, joints, wrench: stance_torques(ROBOT, state, joints, wrench))
-path = jax.jit(lambda start, end, s: swing_path(CONFIG.parameters, start, end, s))
-targets = jax.jit(
-    lambda state, start, start_yaw, end, end_yaw, elapsed: swing_joints(
-        ROBOT,
-        CONFIG.parameters,
-        Measurement(state, STANDS, 0 * STANDS),
-        start=Feet(start, start_yaw),
-        end=Feet(end, end_yaw),
-        elapsed=elapsed,
-        swing=SWING,
-    )
-)
+stance = jax.jit(lambda state, joints, wrench: legs.stance_torques(ROBOT, state, joints, wrench))
+path = jax.jit(lambda start, end, s: legs.swing_path(CONFIG.parameters, start, end, s))
+
+
+@jax.jit
+def targets(state, start, start_yaw, end, end_yaw, elapsed):
+    at, feet = Measurement(state, STANDS, 0 * STANDS), {"start": Feet(start, start_yaw)}
+    feet["end"] = Feet(end, end_yaw)
+    return legs.swing_joints(ROBOT, CONFIG.parameters, at, **feet, elapsed=elapsed, swing=SWING)
 
 
 @partial(jax.jit, static_argnums=0)
 def torques(config, measurement, contact, wrench, target):
     now = {"contact": contact, "wrench": wrench, "target": target}
-    return joint_torques(ROBOT, config.parameters, measurement, **now)
+    return legs.joint_torques(ROBOT, config.parameters, measurement, **now)
 
 
 poses = jax.jit(lambda joints: foot_poses(ROBOT, joints))
@@ -61,16 +49,12 @@ def base(euler=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0)):
 
 @jax.jit
 def world_feet(state, joints):
-    """Foot points and foot axes in the world."""
     R_wb, local = rotation_from_euler(state.euler), poses(joints)
-    return trunk_position(ROBOT, state) + local.position @ R_wb.T, R_wb @ local.rotation
+    return legs.trunk_position(ROBOT, state) + local.position @ R_wb.T, R_wb @ local.rotation
 
 
 START, _ = world_feet(base(), STANDS)
 END = START + jnp.array([[0.15, 0.02, 0.0], [0.1, -0.03, 0.0]])
-
-
-# Stance
 
 
 def test_stance_torques_and_ground_do_no_work_together_at_the_hip():
@@ -120,11 +104,8 @@ def test_stance_torques_and_leg_weight_are_the_statics_of_mujoco(robot, share):
     need, state, wrench = statics(robot, share)
     joints = jnp.asarray(robot.standing_joints)
     weight = jax.jit(leg_gravity)(robot, joints, jnp.asarray(robot.gravity))
-    found = jax.jit(stance_torques)(robot, state, joints, wrench) + weight
+    found = jax.jit(legs.stance_torques)(robot, state, joints, wrench) + weight
     np.testing.assert_allclose(found, need, atol=1e-8)
-
-
-# Swing
 
 
 @pytest.mark.parametrize("step_up", [0.0, 0.05])
@@ -164,7 +145,7 @@ def test_swing_joints_put_the_feet_on_the_path_and_an_overdue_foot_waits_at_its_
     np.testing.assert_allclose(np.arctan2(R[:, 1, 0], R[:, 0, 0]), turned, atol=0.02)
 
 
-def test_swing_rates_are_the_derivative_of_the_angles_under_a_moving_trunk():
+def test_swing_rates_are_those_of_the_angles_and_half_a_turn_is_crossed_the_short_way():
     state, step = base((0.0, 0.05, 0.1), (0.4, 0.1, 0.02)), 1e-5
 
     def at(time):
@@ -174,17 +155,11 @@ def test_swing_rates_are_the_derivative_of_the_angles_under_a_moving_trunk():
     _, rates = swing([0.08] * 2, state)
     np.testing.assert_allclose(rates, (at(step) - at(-step)) / (2 * step), atol=1e-6)
     assert np.abs(rates).max() > 1.0
-
-
-def test_a_swing_across_half_a_turn_takes_the_short_way():
     state = base((0.0, 0.0, np.pi))
     start_yaw, end_yaw = jnp.full(2, np.pi - 0.1), jnp.full(2, -np.pi + 0.1)
     turned = START * jnp.array([-1.0, -1.0, 1.0])
     joints, _ = targets(state, turned, start_yaw, turned, end_yaw, jnp.full(2, SWING))
     np.testing.assert_allclose(np.asarray(joints)[::5], 0.1, atol=1e-9)
-
-
-# Torques
 
 
 def test_stance_legs_push_and_swing_legs_follow_and_carry_their_weight():

@@ -7,30 +7,19 @@ import jax
 import numpy as np
 import pytest
 from model import ANCHOR, ROBOT
-from pretend import pretend_walk
+from pretend import pretend_walk, still_walk
 
-from hector_jax.control.reference import named_command
-from hector_jax.control.weights import nominal
-from hector_jax.core.inputs import InputError
-from hector_jax.core.trajectory import State, Wrench, no_samples
-from hector_jax.grfm.effect import last_command
+from hector_jax import PAPER_LOSS, InputError, LossTerm, last_command, named_command, nominal
+from hector_jax.core.trajectory import State, Wrench, has_fallen
 from hector_jax.report.report import render
-from hector_jax.store.folder import as_row
+from hector_jax.store.run import as_row
+from hector_jax.tuning import loss as loss_terms
 from hector_jax.tuning.difftune import TuneConfig, tune
-from hector_jax.tuning.loss import (
-    PAPER_LOSS,
-    LossTerm,
-    changes_between,
-    loss_of_robot,
-    losses,
-    residuals,
-    switch_loss,
-    total,
-)
+from hector_jax.tuning.loss import changes_between, losses, residuals, total
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.verdict import metrics
 
-parts_of, switches_of = jax.jit(partial(losses, PAPER_LOSS)), jax.jit(switch_loss)
+parts_of, switches_of = jax.jit(partial(losses, PAPER_LOSS)), jax.jit(loss_terms.switch_loss)
 
 
 def walk(count=6, period=0.01):
@@ -38,15 +27,9 @@ def walk(count=6, period=0.01):
     zero = np.zeros((count, 3))
     state = State(zero, zero, zero, zero)
     load = np.tile([0.0, 0.0, 60.0], (count, 2, 1))
-    return no_samples(10, 2)._replace(
-        period=np.array(period),
-        initial=State(*np.zeros((4, 3))),
-        state=state,
-        reference=state,
-        command=Wrench(load, np.zeros_like(load)),
-        contact=np.ones((count, 2), bool),
-        fallen=np.zeros(count, bool),
-    )
+    parts = {"command": Wrench(load, np.zeros_like(load)), "initial": State(*np.zeros((4, 3)))}
+    parts |= {"contact": np.ones((count, 2), bool), "state": state, "reference": state}
+    return still_walk(count, period=np.array(period), **parts)
 
 
 def off_by(trajectory, euler=0.0, position=0.0):
@@ -85,14 +68,11 @@ def test_the_same_errors_cost_the_same_at_any_sampling():
         close(parts_of(fallen_from(slow, sample)), parts_of(fallen_from(fast, 10 * sample)))
 
 
-def test_after_a_fall_each_sample_is_charged_a_fixed_error_at_least():
+def test_after_a_fall_each_sample_is_charged_a_fixed_error_whatever_the_robot_does():
     for error, euler, position in ((0.1, 0.8**2, 0.5**2), (2.0, 3 * 4.0, 3 * 4.0)):
         parts = parts_of(fallen_from(off_by(walk(), error, error), 4))
         assert parts["L_Eul"] == pytest.approx(10 * (4 * 3 * error**2 + 2 * euler))
         assert parts["L_pos"] == pytest.approx(10 * (4 * 3 * error**2 + 2 * position))
-
-
-def test_what_a_fallen_robot_does_is_not_looked_at():
     trajectory = fallen_from(walk(), 3)
     nonsense = np.where(trajectory.fallen[:, None], np.nan, 0.0)
     wild = Wrench(*(w + nonsense[:, None] for w in trajectory.command))
@@ -143,7 +123,7 @@ def test_a_fourth_term_is_tuned_told_and_written_from_one_place():
 def test_a_robot_that_is_elsewhere_can_still_go_as_fast_as_it_should():
     """Velocities count along the robot's own yaw; a file adds the terms by their names."""
     weights = (("L_vel", 2.0), ("L_yaw_rate", 3.0))
-    loss = loss_of_robot(replace(ROBOT.description, loss=weights))
+    loss = loss_terms.loss_of_robot(replace(ROBOT.description, loss=weights))
     assert loss[:3] == PAPER_LOSS
     ahead, aside = np.tile([0.5, 0.0, 0.0], (6, 1)), np.tile([0.0, 0.5, 0.0], (6, 1))
     quarter, there = np.tile([0.0, 0.0, np.pi / 2], (6, 1)), walk()
@@ -161,3 +141,14 @@ def test_terms_that_cannot_be_told_apart_are_refused():
     for loss in ((*PAPER_LOSS, PAPER_LOSS[0]), (LossTerm("sway", "", 1.0, sway),)):
         with pytest.raises(InputError, match="unlike names"):
             TuneConfig(loss=loss)
+
+
+def test_a_fall_is_a_fall():
+    zero = np.zeros(3)
+    upright = State(zero, np.array([0.0, 0.0, 0.41]), zero, zero)
+    assert not has_fallen(upright)
+    assert not has_fallen(upright._replace(euler=np.array([0.7, -0.7, 3.0])))
+    assert has_fallen(upright._replace(position=np.array([0.0, 0.0, 0.24])))
+    assert has_fallen(upright._replace(euler=np.array([0.0, -0.81, 0.0])))
+    assert has_fallen(upright._replace(euler=np.array([0.81, 0.0, 0.0])))
+    assert has_fallen(upright._replace(velocity=np.array([0.0, np.nan, 0.0])))

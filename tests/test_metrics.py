@@ -12,7 +12,6 @@ from hector_jax.verdict import metrics
 
 
 def _judge(scenes=("s",), **losses):
-    """A verdict of losses by plant, the same in each of the scenes."""
     scores = {name: [pretend_score(x) for x in row] for name, row in losses.items()}
     seeds = range(len(next(iter(losses.values()))))
     return metrics.make_verdict(PAPER_LOSS, seeds, dict.fromkeys(scenes, scores))
@@ -65,9 +64,7 @@ def test_fewer_than_six_plants_have_no_interval():
 def test_the_change_is_the_median_of_paired_ratios_not_the_ratio_of_means():
     verdict = _judge(nominal=[1.0, *[10.0] * 4, 100.0], tuned=[0.5, *[8.0] * 4, 99.0])
     change = metrics.compare(verdict, "tuned", "nominal").change["L"]
-    assert change.value == pytest.approx(-20.0)
-    assert change.low == pytest.approx(-50.0)
-    assert change.high == pytest.approx(-1.0)
+    assert (change.value, change.low, change.high) == pytest.approx((-20.0, -50.0, -1.0))
 
 
 def test_an_interval_over_trajectories_is_one_over_plants():

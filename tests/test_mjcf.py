@@ -3,7 +3,6 @@
 import random
 import re
 import xml.etree.ElementTree as ElementTree
-from functools import partial
 
 import mujoco
 import pytest
@@ -11,8 +10,7 @@ from model import EXAMPLES
 from pretend import call
 from published import HOLD, JOINTS, LINK, MOTOR, by_numbers, replaced, small, urdf_of
 
-from hector_jax.control.controller import walk_config
-from hector_jax.core.inputs import InputError
+from hector_jax import InputError, walk_config
 from hector_jax.robot.description import MODEL_PATH, Foot
 from hector_jax.robot.model import compile_model, describe, load_robot, robot_of
 
@@ -41,84 +39,65 @@ POSE = "0 0 0.785398163397 -1.570796326795 0.785398163397"
 LEGS_SWAPPED = TEXT.replace("left_", "?_").replace("right_", "left_").replace("?_", "right_")
 TRUNK = 'pos="0 0 0" mass="5.512"'
 NO_SPHERE = '<collision><geometry><sphere radius="0"/></geometry></collision>'
-OF_TEXT = {  # a file in the place of HECTOR's, and what is told
-    "cut": (TEXT[: len(TEXT) // 2], "malformed XML.* line"),
-    "a list": ("<list/>", "<list>.* expected <mujoco> or <robot>"),
-    "urdf with NaN": (
-        '<robot><link name="a"><inertial><origin xyz="0 nan 0"/></inertial></link></robot>',
-        "<origin>.* xyz is '0 nan 0'.* finite",
+NO_NUMBER = '<robot><link name="a"><inertial><origin xyz="0 nan 0"/></inertial></link></robot>'
+OF_TEXT = {  # by what is told, a file in the place of HECTOR's
+    "malformed XML.* line": TEXT[: len(TEXT) // 2],
+    "<list>.* expected <mujoco> or <robot>": "<list/>",
+    "<origin>.* xyz is '0 nan 0'.* finite": NO_NUMBER,
+    "DOCTYPE": BOMB + TEXT.replace("trunk", "&i;"),
+    "<include> of '/etc/passwd'": put('<include file="/etc/passwd"/>', "<asset>"),
+    "<texture> 'tiles'.* width is '99999999'.* to 8192": swap(
+        'width="512" height="512"', 'width="99999999" height="99999999"'
     ),
-    "entities": (BOMB + TEXT.replace("trunk", "&i;"), "DOCTYPE"),
-    "include": (put('<include file="/etc/passwd"/>', "<asset>"), "<include> of '/etc/passwd'"),
-    "huge picture": (
-        swap('width="512" height="512"', 'width="99999999" height="99999999"'),
-        "<texture> 'tiles'.* width is '99999999'.* to 8192",
+    "memory is '4000G'.* at most 1G": swap('memory="4M"', 'memory="4000G"'),
+    "nested deeper than 100": put(DEEP, "<worldbody>"),
+    "2011 bodies, expected at most 2000": put(
+        "".join(f'<body name="b{i}"/>' for i in range(2000)), "<worldbody>"
     ),
-    "huge memory": (swap('memory="4M"', 'memory="4000G"'), "memory is '4000G'.* at most 1G"),
-    "nested deeply": (put(DEEP, "<worldbody>"), "nested deeper than 100"),
-    "many bodies": (
-        put("".join(f'<body name="b{i}"/>' for i in range(2000)), "<worldbody>"),
-        "2011 bodies, expected at most 2000",
+    "mass is '-5.512'.* above 0": swap('mass="5.512"', 'mass="-5.512"'),
+    "<joint> of 'knee'.* range is '-0.10 -2.38'.* lower one first": swap(
+        'range="-2.38 -0.10"', 'range="-0.10 -2.38"'
     ),
-    "mass negative": (swap('mass="5.512"', 'mass="-5.512"'), "mass is '-5.512'.* above 0"),
-    "range turned round": (
-        swap('range="-2.38 -0.10"', 'range="-0.10 -2.38"'),
-        "<joint> of 'knee'.* range is '-0.10 -2.38'.* lower one first",
+    "MuJoCo refuses.* 'mas'.* did you mean 'mass'": swap('mass="5.512"', 'mas="5.512"'),
+    "bad format in attribute 'fromto' at <geom> of 'left_calf'": swap(
+        'fromto="0 -0.012 0 ', 'fromto="0,1 -0.012 0 ', 1
     ),
-    "misspelt attribute": (
-        swap('mass="5.512"', 'mas="5.512"'),
-        "MuJoCo refuses.* 'mas'.* did you mean 'mass'",
+    "<body> 'b': euler is '0 0 90', expected rad, and these are degrees": put(
+        '<body name="b" euler="0 0 90"/>', "<worldbody>"
     ),
-    "comma": (
-        swap('fromto="0 -0.012 0 ', 'fromto="0,1 -0.012 0 ', 1),
-        "bad format in attribute 'fromto' at <geom> of 'left_calf'",
+    "bad format in attribute 'xyz' at <origin> of 'left_knee'": "<!-- a\n\n-->"
+    + re.sub('(?s)(left_knee".*?xyz=")[^ ]* ', r"\g<1>0,1 ", URDF, count=1),
+    "<origin> of 'left_knee': rpy is '0 180 0', expected rad, and these are degrees": re.sub(
+        '(?s)(left_knee".*?rpy=")[^"]*', r"\g<1>0 180 0", URDF, count=1
     ),
-    "degrees": (
-        put('<body name="b" euler="0 0 90"/>', "<worldbody>"),
-        "<body> 'b': euler is '0 0 90', expected rad, and these are degrees",
+    "<sphere> of 'left_foot': radius is '0', expected numbers above 0": re.sub(
+        "(left_foot.*?)<visual>.*?</visual>", rf"\1{NO_SPHERE}", URDF
     ),
-    "urdf with a comma": (
-        "<!-- a\n\n-->" + re.sub('(?s)(left_knee".*?xyz=")[^ ]* ', r"\g<1>0,1 ", URDF, count=1),
-        "bad format in attribute 'xyz' at <origin> of 'left_knee'",
+    "no keyframe 'standing'": swap('name="standing"', 'name="stand"'),
+    "no sphere 'right_toe' on body": swap('"right_toe"', '"right_tip"'),
+    "no joint 'left_knee'.* did you mean 'left_kneee'.* left_ankle": swap(
+        "left_knee", "left_kneee"
     ),
-    "urdf in degrees": (
-        re.sub('(?s)(left_knee".*?rpy=")[^"]*', r"\g<1>0 180 0", URDF, count=1),
-        "<origin> of 'left_knee': rpy is '0 180 0', expected rad, and these are degrees",
+    "keyframe 'standing'.* expected": swap(KNEE, KNEE.replace("1", "-1")),
+    "left_knee' at -1.571": swap('"-2.38 -0.10"', '"0.10 2.38"'),
+    "'left_knee', which has 2": swap('ctrlrange="-67 67"', 'ctrlrange="-2 2"'),
+    "left_knee' at -2.571": swap(POSE, POSE.replace("-1.57", "-2.57")),
+    "over the feet": swap(TRUNK, TRUNK.replace("0 0 0", "0.5 0 0")),
+    "left_toe.* 0.03 m above the floor": swap(
+        'class="contact" pos="0.09 0 -0.03"', 'class="contact" pos="0.09 0 0"'
     ),
-    "urdf with a shape of no size": (
-        re.sub("(left_foot.*?)<visual>.*?</visual>", rf"\1{NO_SPHERE}", URDF),
-        "<sphere> of 'left_foot': radius is '0', expected numbers above 0",
-    ),
-    "no standing pose": (swap('name="standing"', 'name="stand"'), "no keyframe 'standing'"),
-    "renamed toe": (swap('"right_toe"', '"right_tip"'), "no sphere 'right_toe' on body"),
-    "renamed joint": (
-        swap("left_knee", "left_kneee"),
-        "no joint 'left_knee'.* did you mean 'left_kneee'.* left_ankle",
-    ),
-    "knee axis reversed": (swap(KNEE, KNEE.replace("1", "-1")), "keyframe 'standing'.* expected"),
-    "knee forwards": (swap('"-2.38 -0.10"', '"0.10 2.38"'), "left_knee' at -1.571"),
-    "weak motor": (swap('ctrlrange="-67 67"', 'ctrlrange="-2 2"'), "'left_knee', which has 2"),
-    "pose out of range": (swap(POSE, POSE.replace("-1.57", "-2.57")), "left_knee' at -2.571"),
-    "out of balance": (swap(TRUNK, TRUNK.replace("0 0 0", "0.5 0 0")), "over the feet"),
-    "toe off the sole": (
-        swap('class="contact" pos="0.09 0 -0.03"', 'class="contact" pos="0.09 0 0"'),
-        "left_toe.* 0.03 m above the floor",
-    ),
-    "swapped legs": (
-        LEGS_SWAPPED,
-        "left foot at y = -0.0942.* expected it left of the right one, at 0.0942",
-    ),
+    "left foot at y = -0.0942.* expected it left of the right one, at 0.0942": LEGS_SWAPPED,
 }
 RING = LINK + '<link name="a"/>' + HOLD.format("j", "a", "payload")
-OF_LINKS = {  # what is put into a URDF, and what is told
-    "a loose link": (LINK, "no joint holds payload, expected one tree below trunk"),
-    "a repeated link": ('<link name="left_foot"/>', "got ['left_foot'] empty or twice"),
-    "a repeated joint": (HOLD.format("left_knee", "trunk", "trunk"), "got ['left_knee'] empty or"),
-    "no name": ("<link/>", "got [''] empty or twice"),
-    "an unknown link": (HOLD.format("j", "trunk", "arm"), "joint 'j' joins ['trunk', 'arm'], exp"),
-    "one end": ('<joint name="j"><parent link="trunk"/></joint>', "joint 'j' joins ['trunk']"),
-    "two parents": (HOLD.format("j", "trunk", "left_foot"), "no other joint to have this child"),
-    "a ring": (RING + HOLD.format("k", "payload", "a"), "links payload, a hang in a ring"),
+OF_LINKS = {  # and what is put into a URDF
+    "no joint holds payload, expected one tree below trunk": LINK,
+    "got ['left_foot'] empty or twice": '<link name="left_foot"/>',
+    "got ['left_knee'] empty or": HOLD.format("left_knee", "trunk", "trunk"),
+    "got [''] empty or twice": "<link/>",
+    "joint 'j' joins ['trunk', 'arm'], exp": HOLD.format("j", "trunk", "arm"),
+    "joint 'j' joins ['trunk']": '<joint name="j"><parent link="trunk"/></joint>',
+    "no other joint to have this child": HOLD.format("j", "trunk", "left_foot"),
+    "links payload, a hang in a ring": RING + HOLD.format("k", "payload", "a"),
 }
 
 MESH = '<geom type="mesh" mesh="thigh" density="900"/>'
@@ -126,66 +105,56 @@ COUPLED = '<equality><joint joint1="left_knee" joint2="left_ankle"/></equality>'
 IN_WORLD = '<worldbody><geom type="{}"/></worldbody>'
 SHORT = '<keyframe><key name="up" qpos="0 0 3"/></keyframe>'
 SHIN_AS_FOOT = (Foot(None, ((0.0, 0.0, 0.0),), "left_shin"),) * 2
-OF_PARTS = {  # parts of the small biped, and what is told
-    "no mass": ({"shin": ""}, "body 'left_shin' moves and has no mass"),
-    "a mesh's mass": ({"shin": MESH}, "body 'left_shin' has its mass from a mesh"),
-    "joints of no leg": ({"weld": ()}, "joints waist, shoulder are of no leg: add them to weld"),
-    "a misspelt motor": ({"motors": MOTOR.format("left_rol")}, "did you mean 'left_roll'"),
-    "a coupled leg": ({"more": COUPLED}, "couples left_ankle, left_knee"),
-    "terrain": ({"more": IN_WORLD.format('box" size="1 1 0.1')}, "is terrain"),
-    "a low floor": ({"more": IN_WORLD.format('plane" size="1 1 1" pos="0 0 -1')}, "level at z = 0"),
-    "a short keyframe": ({"more": SHORT, "standing": "up"}, "has 3 numbers"),
-    "a shin as foot": ({"feet": SHIN_AS_FOOT}, "feet.left.body is 'left_shin'"),
-    "out of order": (
-        {"joints": (*JOINTS[1::-1], *JOINTS[2:])},
-        "name each leg from the trunk down",
-    ),
-    "soles not level": (
-        {"contacts": ((0.07, 0.0, -0.04), (-0.05, 0.0, -0.03))},
-        "soles are not level",
-    ),
+OF_PARTS = {  # parts of the small biped
+    "body 'left_shin' moves and has no mass": {"shin": ""},
+    "body 'left_shin' has its mass from a mesh": {"shin": MESH},
+    "joints waist, shoulder are of no leg: add them to weld": {"weld": ()},
+    "did you mean 'left_roll'": {"motors": MOTOR.format("left_rol")},
+    "couples left_ankle, left_knee": {"more": COUPLED},
+    "is terrain": {"more": IN_WORLD.format('box" size="1 1 0.1')},
+    "level at z = 0": {"more": IN_WORLD.format('plane" size="1 1 1" pos="0 0 -1')},
+    "has 3 numbers": {"more": SHORT, "standing": "up"},
+    "feet.left.body is 'left_shin'": {"feet": SHIN_AS_FOOT},
+    "name each leg from the trunk down": {"joints": (*JOINTS[1::-1], *JOINTS[2:])},
+    "soles are not level": {"contacts": ((0.07, 0.0, -0.04), (-0.05, 0.0, -0.03))},
 }
 
 HEAD = "must have left, right; or front_left, front_right, hind_left, hind_right, got "
 ROLL, BODY = '"hind_left_roll"', 'body = "hind_left_calf"'
 CONTACTS = '(front_left_calf"\n)contacts = .*'
-OF_TABLE = {  # a change of the quadruped's TOML, and what is told
-    "three feet": (
-        r"(?s)\[feet.hind_right\].*?\n\n",
-        "",
-        f"{HEAD}front_left, front_right, hind_left$",
-    ),
-    "five legs": (
-        r"\[joints\]",
-        r'\g<0>\nleft = ["a", "b", "c"]',
-        "joints: must have .* got left, fr",
-    ),
-    "a foot of another leg": (
+OF_TABLE = {  # a change of the quadruped's TOML
+    f"{HEAD}front_left, front_right, hind_left$": (r"(?s)\[feet.hind_right\].*?\n\n", ""),
+    "joints: must have .* got left, fr": (r"\[joints\]", r'\g<0>\nleft = ["a", "b", "c"]'),
+    "feet.hind_left.body is 'front_left_calf', expected one that joint 'hind_left_knee'": (
         BODY,
         BODY.replace("hind", "front"),
-        "feet.hind_left.body is 'front_left_calf', expected one that joint 'hind_left_knee'",
     ),
-    "a joint of two legs": (
-        ROLL,
-        '"front_left_roll"',
-        "different names, got 'front_left_roll' twice",
-    ),
-    "feet of two kinds": (
+    "different names, got 'front_left_roll' twice": (ROLL, '"front_left_roll"'),
+    r"as many contacts, got \[2, 1, 1, 1\]": (
         CONTACTS,
         r"\1contacts = [[0.1, 0, -0.2326], [-0.1, 0, -0.2326]]",
-        r"as many contacts, got \[2, 1, 1, 1\]",
     ),
-    "three contacts": (
+    "1, 2 or 4 contacts": (
         CONTACTS,
         r"\1contacts = [[0, 0, -0.23], [0.1, 0, -0.23], [0, 0.1, -0.23]]",
-        "1, 2 or 4 contacts",
     ),
-    "hind legs swapped": (
+    "the hind_left foot at y = -0.142, expected it left of the hind_right one": (
         "hind_(left|right)(?=]| = )",
         lambda found: f"hind_{'right' if found[1] == 'left' else 'left'}",
-        "the hind_left foot at y = -0.142, expected it left of the hind_right one",
     ),
-    "no weights of moments": ("moment = 0.0085", "", "expert: missing field 'moment'"),
+    "expert: missing field 'moment'": ("moment = 0.0085", ""),
+}
+OF_STRIDER = {  # a change of the strider's TOML
+    "robot.toml: unknown field 'gate'.*did you mean 'gait'?": ("[gait]", "[gate]"),
+    "gait: stance must be a whole number.*got '22'": ("stance = 22", 'stance = "22"'),
+    r"legs.kp must be a gain for each of the 5 joints.*got \(150.0,": ("kp = [150,", "kp = ["),
+    "robot.toml: gait.tick must be at most half": ("[mpc]", "[mpc]\nstep_ticks = 1"),
+    "did you mean 'friction'": ("[mpc]", "[mpc]\nconstraints = ['frictoin']"),
+    "joints: left and right must be 3 to 7 names each.*got 4 and 5": ('"left_yaw", ', ""),
+    "joints: linkage must be two.*from 1 to 5": ("linkage = [5, 4]", "linkage = [6, 4]"),
+    r"nominal: euler must be a number.*got \[50, 0": ("l.euler = 50", "l.euler = [50, 0, 50]"),
+    "robot.toml: model is missing.*MJCF or URDF beside": ('model = "strider.xml"', ""),
+    "no site 'left_soul'.*did you mean 'left_sole'?": ('"left_sole"', '"left_soul"'),
 }
 
 
@@ -202,32 +171,35 @@ def load_parts(folder, parts):
     robot_of(small(folder, **parts))
 
 
-def load_table(folder, change):
-    file = EXAMPLES / "quadruped" / "robot.toml"
+def load_table(folder, change, robot="quadruped"):
+    file = EXAMPLES / robot / "robot.toml"
     (folder / file.name).write_text(replaced(file.read_text(), change))
-    (folder / "quadruped.xml").write_bytes(file.with_name("quadruped.xml").read_bytes())
+    (folder / f"{robot}.xml").write_bytes(file.with_name(f"{robot}.xml").read_bytes())
     walk_config(load_robot(folder / file.name))
 
 
+def load_strider(folder, change):
+    old, new = change
+    load_table(folder, (re.escape(old), new), "strider")
+
+
+TABLES = {load_text: OF_TEXT, load_parts: OF_PARTS, load_table: OF_TABLE, load_strider: OF_STRIDER}
+
+
 def refusals():
-    for name, (text, words) in OF_TEXT.items():
-        yield pytest.param(partial(load_text, text=text), words, id=name)
-    for name, (links, words) in OF_LINKS.items():
-        text = URDF.replace("</robot>", f"{links}</robot>")
-        yield pytest.param(partial(load_urdf, text=text), re.escape(words), id=name)
-    text, words = urdf_of(HECTOR, effort=False), "'left_hip_yaw' has no torque limit"
-    yield pytest.param(partial(load_urdf, text=text), words, id="no effort")
-    for name, (parts, words) in OF_PARTS.items():
-        yield pytest.param(partial(load_parts, parts=parts), words, id=name)
-    for name, (*change, words) in OF_TABLE.items():
-        yield pytest.param(partial(load_table, change=change), words, id=name)
+    yield load_urdf, urdf_of(HECTOR, effort=False), "'left_hip_yaw' has no torque limit"
+    for words, links in OF_LINKS.items():
+        yield load_urdf, URDF.replace("</robot>", f"{links}</robot>"), re.escape(words)
+    for load, table in TABLES.items():
+        yield from ((load, changed, words) for words, changed in table.items())
 
 
-@pytest.mark.parametrize(("load", "words"), list(refusals()))
-def test_broken_and_hostile_files_are_told_in_one_line(load, words, monkeypatch, tmp_path, capfd):
+@pytest.mark.parametrize("case", list(refusals()), ids=lambda case: case[-1])
+def test_broken_and_hostile_files_are_told_in_one_line(case, monkeypatch, tmp_path, capfd):
     monkeypatch.chdir(tmp_path)
+    load, changed, words = case
     with pytest.raises(InputError) as caught:
-        load(tmp_path)
+        load(tmp_path, changed)
     message = str(caught.value)
     assert message.startswith(str(tmp_path))
     assert "\n" not in message
@@ -237,15 +209,12 @@ def test_broken_and_hostile_files_are_told_in_one_line(load, words, monkeypatch,
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize(
-    "asset",
-    [
-        '<mesh name="m" file="/etc/passwd"/>',
-        '<mesh name="m" file="link/a.stl"/>',
-        '<hfield name="m" file="a.png" size="1 1 1 1"/>',
-        '<texture name="m" type="cube" fileup="../a.png"/>',
-    ],
-)
+ASSETS = ['<mesh name="m" file="/etc/passwd"/>', '<mesh name="m" file="link/a.stl"/>']
+ASSETS += ['<hfield name="m" file="a.png" size="1 1 1 1"/>']
+ASSETS += ['<texture name="m" type="cube" fileup="../a.png"/>']
+
+
+@pytest.mark.parametrize("asset", ASSETS)
 def test_meshes_and_pictures_are_never_opened(tmp_path, asset):
     folder = tmp_path / "robot"
     folder.mkdir()

@@ -12,19 +12,8 @@ import scipy.linalg
 from model import ROBOT, WEIGHT, random_weights
 from oracles import exact_solution, pack_state
 
-from hector_jax.control.contact import (
-    FLAT_FOOT,
-    FRICTION,
-    LINE_FOOT,
-    LINE_FRICTION,
-    Contact,
-    InputConstraint,
-    InputCost,
-    Rows,
-    Squares,
-    StateConstraint,
-    StateCost,
-)
+from hector_jax.control import LINE_FOOT, InputConstraint, InputCost, Squares, StateConstraint
+from hector_jax.control.contact import FLAT_FOOT, FRICTION, LINE_FRICTION, Contact, Rows, StateCost
 from hector_jax.control.disturbance import NO_DISTURBANCE
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, build_qp, solve_mpc
 from hector_jax.control.parameters import bounds
@@ -58,10 +47,6 @@ def answer(config, weights, state, horizon, contacts, lacking=NO_DISTURBANCE):
 
 def solve(*args):
     return answer(*args)[0]
-
-
-def write(*args):
-    return answer(*args)[1]
 
 
 linearise = jax.jit(jax.vmap(lambda e, r: srbm.linearise(ROBOT, e, r, DT)))
@@ -121,7 +106,6 @@ def rolled_out(state, horizon, u):
 
 
 def cost(weights, state, horizon, u):
-    """Eq. 3 of the states that are rolled out."""
     Q, R = np.concatenate(weights.Q), np.asarray(pack_wrench(weights.R))
     wanted = np.concatenate(horizon.reference, axis=1)
     states = rolled_out(state, horizon, u)[:, :12]
@@ -283,7 +267,7 @@ def test_costs_of_ones_own_are_added_to_those_of_the_weights():
         assert np.abs(plain.x - expected.x).max() > 0.1
 
 
-def test_constraints_are_chosen_by_name_and_none_are_those_of_the_contact_model():
+def test_constraints_are_chosen_by_name_and_are_else_those_of_the_contact_model():
     names = ["friction", "unilateral_force", "line_pressure", "line_friction"]
     table = {"contact": "line", "constraints": names}
     assert from_table("robot.toml", MpcConfig, table) == CONFIG
@@ -293,9 +277,6 @@ def test_constraints_are_chosen_by_name_and_none_are_those_of_the_contact_model(
     assert pickle.loads(pickle.dumps(CONFIG)) == CONFIG
     assert [str(one) for one in MpcConfig(line_friction=False).on("inputs")] == names[:3]
     assert replace(MpcConfig(line_friction=False), line_friction=True) == MpcConfig()
-
-
-def test_a_config_with_another_contact_model_has_the_constraints_of_that_one():
     flat = replace(MpcConfig(), contact=FLAT_FOOT)
     assert (flat, flat.constraints) == (MpcConfig(contact=FLAT_FOOT), FLAT_FOOT.constraints)
     assert replace(flat, contact=LINE_FOOT, friction=0.5) == MpcConfig(friction=0.5)

@@ -9,10 +9,8 @@ import pytest
 from model import LEARNS_TOUCHDOWNS, ROBOT
 from synthetic import synthetic_walk
 
-from hector_jax.control.controller import WalkConfig
+from hector_jax import TuneConfig, WalkConfig, Wrench, named_command
 from hector_jax.control.gait import GaitConfig
-from hector_jax.control.reference import named_command
-from hector_jax.core.trajectory import Wrench
 from hector_jax.core.tree import stack
 from hector_jax.grfm import paper, residual
 from hector_jax.grfm.dataset import ACROSS, ALONG, at_interval, make_dataset, with_mirror
@@ -23,7 +21,6 @@ from hector_jax.grfm.paper import fit_linear, fit_scaling
 from hector_jax.grfm.residual import BOUND, plain_net
 from hector_jax.grfm.training import predict
 from hector_jax.store.tunings import Problem, rollouts_of
-from hector_jax.tuning.difftune import TuneConfig
 
 apply = jax.jit(lambda effect, window: effect(window))
 
@@ -84,7 +81,7 @@ def test_a_drawn_model_has_one_member_and_their_mean_is_the_ensemble(params, ens
         jax.tree.map(np.testing.assert_array_equal, effect, as_effect(params))
 
 
-def test_the_derivative_in_64_bits_agrees_with_differences_and_both_modes(either, window):
+def test_the_derivative_is_that_of_differences_in_both_modes_and_finite_in_silence(either, window):
     effect = as_effect(either)
     force, moment = np.random.default_rng(2).normal(size=(2, HISTORY, 2, 3))
     along = Wrench(force, 0.1 * moment)
@@ -105,9 +102,6 @@ def test_the_derivative_in_64_bits_agrees_with_differences_and_both_modes(either
     assert np.isfinite(forward)
     np.testing.assert_allclose(forward, differences, rtol=1e-6)
     np.testing.assert_allclose(forward, reverse, rtol=1e-12)
-
-
-def test_the_gradient_is_finite_where_nothing_is_commanded(either, window):
     silent = window._replace(commands=jax.tree.map(jnp.zeros_like, window.commands))
     total = jax.jit(jax.grad(lambda w: as_effect(either)(w).wrench.force.sum(), allow_int=True))
     assert all(np.isfinite(g).all() for g in total(silent).commands)
@@ -140,9 +134,6 @@ def test_a_net_with_a_nan_is_refused_by_name(tmp_path, params):
         load_net(path, ROBOT)
 
 
-# The residual variant
-
-
 def test_a_mirrored_window_has_the_mirrored_effect(data, ensemble):
     told, count = predict(as_effect(ensemble), with_mirror(data).window), len(data.walk)
     here, there = (jax.tree.map(lambda x, k=k: x[k : k + count], told) for k in (0, count))
@@ -153,16 +144,6 @@ def test_a_mirrored_window_has_the_mirrored_effect(data, ensemble):
     close(here.legs.torque * ACROSS, there.legs.torque)
     close(here.touchdown_error[:, ::-1] * ALONG, there.touchdown_error)
     assert np.any(here.touchdown_error != 0.0)
-
-
-def test_a_command_that_stays_is_returned_as_it_is(gated, window):
-    held = jax.tree.map(lambda w: jnp.broadcast_to(w[:1], w.shape), window.commands)
-    more = jax.tree.map(lambda w: w.at[:, 0].add(3.0), held)
-    phi = as_effect(gated)
-    before, after = (apply(phi, window._replace(commands=c)).wrench for c in (held, more))
-    assert window.contact[0]
-    np.testing.assert_allclose(after.force - before.force, [[3.0] * 3, [0.0] * 3], atol=1e-9)
-    np.testing.assert_allclose(after.moment - before.moment, [[3.0] * 3, [0.0] * 3], atol=1e-9)
 
 
 def test_what_the_nets_add_is_bounded_and_fades_far_from_the_data(ensemble, window):
@@ -200,10 +181,17 @@ def test_the_gated_map_finds_a_ground_that_is_gated_and_linear(data, windows, ga
     assert np.abs(error).max() < 0.02 * told.touchdown_error[lands].std()
 
 
-def test_a_leg_pushes_only_while_it_swings(gated, window):
+def test_a_command_that_stays_is_returned_and_a_leg_pushes_only_while_it_swings(gated, window):
+    held = jax.tree.map(lambda w: jnp.broadcast_to(w[:1], w.shape), window.commands)
+    more = jax.tree.map(lambda w: w.at[:, 0].add(3.0), held)
+    phi = as_effect(gated)
+    before, after = (apply(phi, window._replace(commands=c)).wrench for c in (held, more))
+    assert window.contact[0]
+    np.testing.assert_allclose(after.force - before.force, [[3.0] * 3, [0.0] * 3], atol=1e-9)
+    np.testing.assert_allclose(after.moment - before.moment, [[3.0] * 3, [0.0] * 3], atol=1e-9)
     standing = window._replace(contact=jnp.array([True, True]))
-    assert np.any(apply(as_effect(gated), window).legs.force != 0.0)
-    assert not np.any(apply(as_effect(gated), standing).legs.force)
+    assert np.any(apply(phi, window).legs.force != 0.0)
+    assert not np.any(apply(phi, standing).legs.force)
 
 
 def test_the_plain_net_returns_every_command_and_has_the_shapes_of_a_trained_one(windows, ensemble):

@@ -7,24 +7,19 @@ import numpy as np
 import pytest
 from model import OTHERS, ROBOT
 
-from hector_jax.control.controller import WalkConfig
-from hector_jax.control.reference import named_command
-from hector_jax.control.weights import expert, nominal
+from hector_jax import Job, WalkConfig, expert, load_robot, named_command, nominal, walk
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.robot.description import MODEL_PATH
-from hector_jax.robot.model import load_robot
-from hector_jax.sim.loop import Job
 from hector_jax.sim.mjx_model import batched_model, mjx
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.standin import standin
-from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Push, build_world, build_worlds, hfs, hfs_drawn, ideal
 
 CONFIG = WalkConfig()
 UNUSED = ("cam_", "light_", "actuator_acc0")  # by MJX, in a robot without muscles
 
 
-def test_only_what_differs_between_plants_is_batched():
+def test_only_what_differs_is_batched_and_contacts_are_of_feet_and_between_legs_alone():
     worlds = build_worlds([hfs_drawn(seed) for seed in range(3)])
     shared, varied = batched_model(worlds)
     for name in shared.__dataclass_fields__:
@@ -35,9 +30,6 @@ def test_only_what_differs_between_plants_is_batched():
             else:
                 np.testing.assert_array_equal(values[0], values[1], err_msg=name)
     assert shared.nq == worlds[0].model.nq
-
-
-def test_mjx_looks_for_contacts_of_the_feet_and_between_the_legs_alone():
     world = build_world(hfs())
     model, _ = batched_model([world])
     found = jax.jit(lambda data: mjx.collision(model, mjx.kinematics(model, data)))

@@ -9,11 +9,9 @@ import pytest
 from lib import sample_weights
 from model import ROBOT, small_effect
 
-from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax import RolloutConfig, Scenario, State, named_command, rollout, standing_anchor
 from hector_jax.control.weights import nominal, vector_to_weights, weights_to_vector
-from hector_jax.core.trajectory import State
 from hector_jax.tuning.parallel_rollout import parallel_rollout
-from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.tuning.variation import no_variation
 
 EFFECT = small_effect()

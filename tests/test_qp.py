@@ -1,32 +1,24 @@
-"""The QP door against independent answers: solutions, statuses, derivatives."""
+"""The QP door against independent answers: solutions, statuses, derivatives; the GPU kernel."""
 
+import subprocess
+import sys
 from functools import cache, partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracles
 import pytest
-from oracles import (
-    central_difference,
-    condensed_walk,
-    dense_rows,
-    exact_solution,
-    general_qp,
-    kkt_residual,
-    other_minimiser,
-    walking_qp,
-)
+from oracles import exact_solution, walking_qp
 
 from benchmarks.problems import draw_problems, layer_qp
-from hector_jax.control.controller import WalkConfig
+from hector_jax import WalkConfig, load_robot
 from hector_jax.core.settings import from_table, to_table
 from hector_jax.core.tree import stack
-from hector_jax.qp import QP, QpConfig, Solver, Status, check_solved, gpu_kernel, solve_qp
+from hector_jax.qp import JAXOPT, QP, QpConfig, Solver, Status, check_solved, gpu_kernel, solve_qp
 from hector_jax.qp.active_set import first_guess
 from hector_jax.qp.interior_point import approach
-from hector_jax.qp.method import JAXOPT
-from hector_jax.robot.model import load_robot
 
 WALKING = 500
 SHAPES = [(1, 4), (2, 6), (5, 12), (12, 30), (30, 40), (50, 70), (120, 100)]
@@ -68,7 +60,7 @@ def still(qp):
 @cache
 def general(n, m):
     """EACH general QPs with their minimisers and conditions, and what is found of them."""
-    made = [general_qp(seed, n, m) for seed in range(EACH)]
+    made = [oracles.general_qp(seed, n, m) for seed in range(EACH)]
     return made, solve_all([qp for qp, _, _ in made])
 
 
@@ -82,13 +74,9 @@ def walked(walking):
     return stack([still(qp) for qp in walking])
 
 
-@pytest.fixture(scope="module")
-def exact(walking):
-    return np.stack([exact_solution(qp)[0] for qp in walking])
-
-
-def test_walking_qps_are_solved_to_the_first_newton(walked, exact):
+def test_walking_qps_are_solved_to_the_first_newton(walking, walked):
     check_solved(walked)
+    exact = np.stack([exact_solution(qp)[0] for qp in walking])
     error = np.abs(walked.x - exact)[:, :5].max(axis=1)
     assert np.median(error) <= 1e-8
     assert error.max() <= 1e-4
@@ -116,7 +104,7 @@ def test_general_qps_are_right(n, m):
     assert (found.status[definite] == Status.SOLVED).all()
     assert np.isin(found.status, (Status.SOLVED, Status.NOT_UNIQUE)).all()
     for i, (qp, x, cond) in enumerate(made):
-        residual = kkt_residual(qp, found.x[i], found.y[i])
+        residual = oracles.kkt_residual(qp, found.x[i], found.y[i])
         assert residual <= (1e-8 if cond <= 1e4 else 1e-6), (i, residual, cond)
         if cond <= 1e4:
             np.testing.assert_allclose(found.x[i], x, atol=1e-4 * np.abs(x).max())
@@ -126,7 +114,7 @@ def test_general_qps_are_right(n, m):
 def test_a_minimiser_is_not_unique_just_where_a_linear_program_finds_another(n, m):
     made, found = general(n, m)
     flat = [i for i, (_, _, cond) in enumerate(made) if np.isinf(cond)]
-    unique = np.array([other_minimiser(made[i][0], found.x[i]) < 1e-3 for i in flat])
+    unique = np.array([oracles.other_minimiser(made[i][0], found.x[i]) < 1e-3 for i in flat])
     np.testing.assert_array_equal(found.status[flat] == Status.SOLVED, unique)
     assert 10 < unique.sum() < len(flat) - 10
 
@@ -259,8 +247,7 @@ def test_a_verdict_changes_at_its_threshold_and_the_derivative_with_it(name):
     for told, values in sides.items():
         status = Status[told]
         for value in values:
-            qp = make(value)
-            alone = solve(qp)
+            alone = solve(qp := make(value))
             found, moved = along(qp, jax.tree.map(jnp.ones_like, qp))
             assert Status(int(alone.status)) == status, value
             assert found.status == alone.status
@@ -322,12 +309,9 @@ def test_curvature_is_judged_in_units_of_the_variables():
             np.testing.assert_allclose(found_x / D, x, atol=1e-10 * np.abs(x).max())
 
 
-def test_a_row_of_small_numbers_binds():
+def test_rows_of_small_numbers_bind_bounds_move_and_crossed_ones_are_an_equality_in_the_middle():
     pressed = solve(rows((1e-9 * np.array(FIRST), -INF, -1e-9), (BOTH, -INF, 9.0)))
     np.testing.assert_allclose(pressed.x, [-1.0, 5.0], atol=1e-9)
-
-
-def test_bounds_move_the_solution_and_crossed_ones_are_an_equality_with_their_middle():
     for lower, upper, at, moves in ((-INF, 0.5, 0.5, 1.0), (1.0 + 1e-9, 1.0 - 1e-9, 1.0, 0.5)):
         qp = rows((FIRST, lower, upper))
         found, moved = along(qp, only(qp, u=np.ones(3)))
@@ -336,7 +320,7 @@ def test_bounds_move_the_solution_and_crossed_ones_are_an_equality_with_their_mi
 
 
 def test_condensed_walks_are_solved_though_the_first_rows_are_zeros():
-    walks = [condensed_walk(seed) for seed in range(EACH)]  # SHAPES[3], compiled once
+    walks = [oracles.condensed_walk(seed) for seed in range(EACH)]  # SHAPES[3], compiled once
     first = np.array([qp.u[:2].min() for qp in walks])
     assert (first < 0).sum() >= 5
     assert np.abs(first).max() < 1e-16
@@ -371,24 +355,16 @@ def of_kind(seed):
 
 def with_rows(qp, rows, lower, upper):
     """Three more rows, so that all have one shape."""
-    return qp._replace(
-        A=np.concatenate([qp.A, np.broadcast_to(rows, (3, 5))]),
-        l=np.concatenate([qp.l, lower]),
-        u=np.concatenate([qp.u, upper]),
-    )
+    A = np.concatenate([qp.A, np.broadcast_to(rows, (3, 5))])
+    return qp._replace(A=A, l=np.r_[qp.l, lower], u=np.r_[qp.u, upper])
 
 
 def in_units(qp, objective=1.0, row=1.0, variable=1.0):
     """The same problem with objective, rows and variables in other units; new rows keep theirs."""
     row = np.r_[np.broadcast_to(row, 9), np.ones(3)]
     variable = np.broadcast_to(variable, 5)
-    return QP(
-        objective * qp.P * np.outer(variable, variable),
-        objective * qp.q * variable,
-        row[:, None] * qp.A * variable,
-        row * qp.l,
-        row * qp.u,
-    )
+    P, q = objective * qp.P * np.outer(variable, variable), objective * qp.q * variable
+    return QP(P, q, row[:, None] * qp.A * variable, row * qp.l, row * qp.u)
 
 
 def test_units_redundant_rows_and_rounding_change_no_verdict():
@@ -398,12 +374,9 @@ def test_units_redundant_rows_and_rounding_change_no_verdict():
         never = [-INF] * 3, [INF] * 3
         past, noise = ([-INF, 1e-17, -1.0], [-1e-17, INF, 1e-17]), 1e-17 * rng.normal(size=(3, 5))
         again = [qp.l[8], -2.0 * qp.u[1], -INF], [INF, -2.0 * qp.l[1], INF]
-        for more in (
-            with_rows(qp, 0.0, *never),
-            with_rows(qp, [qp.A[8], -2.0 * qp.A[1], 0.1 * qp.A[2]], *again),
-            with_rows(qp, 0.0, *past),
-            with_rows(qp, noise, *past),
-        ):
+        same = [qp.A[8], -2.0 * qp.A[1], 0.1 * qp.A[2]], *again
+        for rows_added in ((0.0, *never), same, (0.0, *past), (noise, *past)):
+            more = with_rows(qp, *rows_added)
             for size in (1.0, 1e-6, 1e-3, 1e3, 1e6):
                 one_row, one_variable = np.ones(9), np.ones(5)
                 one_row[rng.integers(9)] = one_variable[rng.integers(5)] = size
@@ -476,7 +449,8 @@ def test_each_status_has_its_meaning_and_is_documented():
 
 
 def test_block_rows_are_those_of_the_dense_matrix(walking, walked):
-    dense = solve_all([qp._replace(A=dense_rows(qp.A)) for qp in walking[:EACH]])  # SHAPES[5]
+    made = [qp._replace(A=oracles.dense_rows(qp.A)) for qp in walking[:EACH]]
+    dense = solve_all(made)  # of SHAPES[5]
     np.testing.assert_allclose(walked.x[:EACH], dense.x, atol=1e-8)
     np.testing.assert_allclose(walked.y[3], dense.y[3], atol=1e-8)  # unique, unlike some others
 
@@ -494,7 +468,7 @@ def test_a_batch_is_a_loop_whatever_becomes_of_its_problems(walking):
     assert [Status(code).name for code in np.asarray(batch.status)] == expected
 
 
-def test_a_solver_is_a_value_and_one_of_ones_own_is_another(walking, walked):
+def test_a_solver_is_a_value_jaxopt_is_one_and_one_of_ones_own_another(walking, walked):
     read = from_table("file", QpConfig, {"solver": "jaxopt"})
     assert (read, hash(read)) == (QpConfig(JAXOPT), hash(QpConfig(JAXOPT)))
     assert to_table(read)["solver"] == "jaxopt"
@@ -508,9 +482,6 @@ def test_a_solver_is_a_value_and_one_of_ones_own_is_another(walking, walked):
     found = [solve(qp, cold) for qp in walking[:4]]
     assert set(called) == {59}
     np.testing.assert_allclose(stack(found).x, walked.x[:4], atol=1e-6)
-
-
-def test_jaxopt_is_a_second_solver_behind_the_door(walking):
     for qp in walking[:4]:
         tangent = only(qp, q=np.ones(50))
         ours, mine = along(qp, tangent)
@@ -533,7 +504,7 @@ def test_derivative_is_that_of_an_exact_solver(walking):
         for tangent in tangents(seed, qp):
             _, moved = along(qp, tangent)
             # A change of the active set inside the step shows in the larger one only.
-            found = [central_difference(qp, tangent, step) for step in (1e-5, 1e-6)]
+            found = [oracles.central_difference(qp, tangent, step) for step in (1e-5, 1e-6)]
             size = np.linalg.norm(found[1])
             errors.append(min(np.linalg.norm(moved - f) for f in found) / size)
     assert np.median(errors) <= 1e-7, np.median(errors)
@@ -556,7 +527,7 @@ def test_forward_and_reverse_are_one_derivative(walking):
 
 @pytest.mark.parametrize("times", [1e3, 1e6])
 def test_a_q_that_is_too_large_makes_no_problem_infeasible_or_unbounded(times):
-    made = [general_qp(seed, 5, 12)[0] for seed in range(3 * EACH)]
+    made = [oracles.general_qp(seed, 5, 12)[0] for seed in range(3 * EACH)]
     found = solve_all([qp._replace(q=times * qp.q) for qp in made])
     assert np.isin(found.status, [Status.SOLVED, Status.NOT_UNIQUE]).all()
 
@@ -652,8 +623,7 @@ def test_derivative_is_finite_where_it_is_one_sided():
     assert np.isfinite(moved).all()
 
 
-def test_data_that_is_not_finite_is_told_and_moves_nothing():
-    @jax.jit
+def test_data_that_is_not_finite_is_told_and_moves_nothing_and_residuals_have_no_slope():
     def pull(qp):
         return jax.grad(lambda qp: jnp.sum((found := solve_qp(qp)).x + found.y[0]))(qp)
 
@@ -665,12 +635,8 @@ def test_data_that_is_not_finite_is_told_and_moves_nothing():
             assert along(qp, good)[0].status == Status.BAD_DATA
             assert not np.any(np.concatenate([along(qp, good)[1], *map(np.ravel, pull(qp))]))
 
-
-def test_residuals_have_no_slope():
-    """They are evidence; a loss that holds them is not pulled by their rounding."""
-
     @jax.jit
-    def slopes(qp):
+    def slopes(qp):  # of evidence: a loss that holds it is not pulled by its rounding
         moved = jax.jvp(solve_qp, (qp,), (qp,))[1]
         return moved.primal_residual, moved.dual_residual, moved.gap
 
@@ -720,23 +686,59 @@ def test_a_program_with_strict_promotion_can_solve_and_differentiate(kind):
     low, high = np.array([1.0, 0.0], kind), np.array([1.0, 0.2], kind)
     blocks = QP(np.eye(2, dtype=kind), -one, np.eye(2, dtype=kind)[:, None, :1], -one, one)
     with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
-        for qp in (
-            QP(np.eye(2, dtype=kind), 0 * one, A, low, high),
-            blocks._replace(A=A[:1, None]),
-        ):
+        dense = QP(np.eye(2, dtype=kind), 0 * one, A, low, high)
+        for qp in (dense, blocks._replace(A=A[:1, None], l=-one[:1], u=one[:1])):
             qp = jax.tree.map(jnp.asarray, qp)
-            if qp.A.ndim == 3:
-                qp = qp._replace(l=qp.l[:1], u=qp.u[:1])
             slope = jax.jit(jax.grad(jax.jit(lambda q, qp=qp: solve_qp(qp._replace(q=q)).x[0])))
             assert np.isfinite(slope(qp.q)).all()
-            found = solve_qp(qp).x
-            assert found.dtype == kind
+            assert solve_qp(qp).x.dtype == kind
     found = solve_qp(QP(np.eye(2), 0.0 * one, A, low, high)).x
     np.testing.assert_allclose(found, [0.2, 0.8], atol=1e-6)
 
 
 def test_whole_numbers_are_solved_in_the_default_floats():
-    qp = QP(*(jnp.asarray(x) for x in ([[2, 0], [0, 2]], [-2, -5], [[1, 2]], [-10], [3])))
-    found = solve_qp(qp)
+    parts = [[2, 0], [0, 2]], [-2, -5], [[1, 2]], [-10], [3]
+    found = solve_qp(QP(*map(jnp.asarray, parts)))
     assert found.x.dtype == np.float64
     np.testing.assert_allclose(found.x, [0.4, 1.3], atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_the_guess_is_the_active_set_of_the_solution(dtype):
+    qps = [walking_qp(seed) for seed in range(12)]
+    cases, truth = [], []
+    for qp in qps:
+        column = 1.0 / np.sqrt(np.diag(qp.P))
+        A = qp.A * column.reshape(len(qp.A), 1, -1)
+        row = 1.0 / np.linalg.norm(A, axis=2)
+        size = np.abs(column * qp.q).max()
+        normal = [column[:, None] * qp.P * column, column * qp.q / size, row[..., None] * A]
+        normal += [row.ravel() * bound / size for bound in (qp.l, qp.u)]
+        cases.append([np.asarray(part, dtype) for part in normal])
+        y = exact_solution(qp)[1]
+        truth.append(np.where(np.abs(y) > 1e-9 * np.abs(y).max(initial=1.0), np.sign(y), 0))
+    run = jax.jit(jax.vmap(lambda *qp: gpu_kernel.guess(*qp, curvature=1e-8, interpret=True)))
+    found = run(*(jnp.stack(parts) for parts in zip(*cases, strict=True)))
+    assert found.settled.all()
+    right = (np.asarray(found.side) == np.array(truth)).all(axis=1)
+    assert right.all() if dtype is np.float64 else right.mean() > 0.7
+    assert found.x.dtype == dtype
+    assert (found.definite == (dtype is np.float64)).all()
+
+
+@pytest.mark.parametrize(("least", "definite"), [(2e-8, 1), (0.5e-8, 0), (0.0, 0), (-1.0, 0)])
+def test_the_kernel_knows_a_definite_matrix(least, definite):
+    basis = np.linalg.qr(np.random.default_rng(0).normal(size=(5, 5)))[0]
+    P = basis @ np.diag([1.0, 1.0, 1.0, 1.0, least]) @ basis.T
+    free = np.full(2, np.inf)
+    qp = map(jnp.asarray, (P, np.ones(5), np.ones((1, 2, 5)), -free, free))
+    assert gpu_kernel.guess(*qp, curvature=1e-8, interpret=True).definite == definite
+
+
+def test_only_small_problems_fit_and_the_package_loads_without_triton():
+    assert gpu_kernel.fits(50, 110)
+    assert gpu_kernel.fits(gpu_kernel.VARIABLES, gpu_kernel.ROWS)
+    assert not gpu_kernel.fits(100, 110)
+    assert not gpu_kernel.fits(50, 220)
+    absent = "import sys; sys.modules['jaxlib.mlir._mlir_libs._triton_ext'] = None"
+    subprocess.run([sys.executable, "-c", f"{absent}; import hector_jax.tuning.batch"], check=True)

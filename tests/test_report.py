@@ -25,20 +25,16 @@ def printed(verdict, **options):
 
 
 def written(folder, verdict=None, **others):
-    """The text of report.md."""
     history = pretend_history(14, refused=(3, 12))
     history[12] = history[12]._replace(status=np.array(StepStatus.UNSOLVED))
+    direction = Direction(0.25, 0.96, {"Q_pitch": 0.9, "Q_x": -0.4})
     tuning, small = tuning_of(history, bounds()[1]), np.array(Stop.SMALL_STEP)
     contents = {
         "trajectory": "straight",
         "verdict": verdict or pretend_verdict(),
         "tunings": {"without": tuning, "with": tuning._replace(stop=small), "best": tuning},
         "norms": {"without": {"L_Eul": 12.0, "L_pos": 7.0, "L_ctrl": 8e5}},
-        "determined": Determined(
-            [Direction(0.25, 0.96, {"Q_pitch": 0.9, "Q_x": -0.4})],
-            18,
-            {"Q_pitch": 0.9, "R_Mz": 0.1},
-        ),
+        "determined": Determined([direction], 18, {"Q_pitch": 0.9, "R_Mz": 0.1}),
         "errors": errors(),
         "pictures": [Picture("loss.png", "Loss by iteration.")],
         "film": "no film: MuJoCo cannot draw here (egl: no device)",
@@ -168,14 +164,9 @@ def test_the_report_tells_what_was_promised_and_what_is_particular_to_a_run(tmp_
     touch = verdict.scores["with"]._replace(legs_touch=np.array([[0.03]] + [[0.0]] * 7))
     verdict = verdict._replace(scores=verdict.scores | {"with": touch}, loss=weighed)
     assert OF_WALKS.strip().splitlines()[-1] in printed(verdict)
-    text = written(
-        tmp_path,
-        verdict,
-        errors=errors(touchdown=[9.0, 4.0]),
-        film=Picture("film.mp4", "Before and after."),
-        walks=tuned_on_walks(),
-        begun_with="with",
-    )
+    more = {"film": Picture("film.mp4", "Before and after."), "walks": tuned_on_walks()}
+    more |= {"errors": errors(touchdown=[9.0, 4.0]), "begun_with": "with"}
+    text = written(tmp_path, verdict, **more)
     for words in OF_WALKS.strip().splitlines():
         assert words in text
     for block in text.split("\n\n"):  # every table is well formed
@@ -184,7 +175,7 @@ def test_the_report_tells_what_was_promised_and_what_is_particular_to_a_run(tmp_
     assert "\n*" not in text.replace("\n*Loss", "")
 
 
-def test_the_report_opens_with_errors_falls_and_what_to_do_next(tmp_path):
+def test_the_report_opens_with_errors_falls_and_the_next_step_and_says_below_where_it_is(tmp_path):
     verdict = pretend_verdict(fallen={("expert", 0)})
     lines = report.first_lines(verdict, "latest")
     of = report.plain_errors(verdict, "with")
@@ -193,9 +184,6 @@ def test_the_report_opens_with_errors_falls_and_what_to_do_next(tmp_path):
     assert lines[1].endswith("the tuning has not seen: with 0, nominal 0, expert 1.")
     assert all(f"`hector {name} latest`" in lines[2] for name in ("view", "export"))
     assert written(tmp_path, verdict).split("\n\n")[1:4] == lines
-
-
-def test_the_report_says_below_only_where_the_loss_is_below(tmp_path):
     verdict = pretend_verdict()
     swapped = {"nominal": verdict.scores["with"], "with": verdict.scores["nominal"]}
     text = written(tmp_path, verdict._replace(scores=verdict.scores | swapped))

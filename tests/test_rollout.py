@@ -2,37 +2,28 @@
 
 from dataclasses import replace
 from functools import cache, partial
+from itertools import product
 
 import jax
 import jax.numpy as jnp
+import model
 import numpy as np
 import pytest
 import sensitivity
 from lib import sample_weights
-from model import (
-    ANCHOR,
-    CONFIG,
-    LEARNS_TOUCHDOWNS,
-    PLAIN,
-    ROBOT,
-    SHORT,
-    random_weights,
-    small_effect,
-    vector,
-)
+from model import ANCHOR, CONFIG, PLAIN, ROBOT, SHORT, random_weights, vector
 
+from hector_jax import RolloutConfig, Scenario, last_command, rollout
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.tree import stack
 from hector_jax.grfm.dataset import make_dataset
-from hector_jax.grfm.effect import last_command
 from hector_jax.tuning.curvature import least_squares_jit
 from hector_jax.tuning.difftune import TuneConfig, init, step_status, tune_step
 from hector_jax.tuning.evaluate import evaluate, evaluate_jit, gradient_norms
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total, with_alphas
 from hector_jax.tuning.parallel_rollout import parallel_rollout
-from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
 from hector_jax.tuning.status import StepStatus
 from hector_jax.tuning.variation import drawn_variation
 
@@ -75,7 +66,7 @@ def test_a_foot_lands_where_phi_says_and_a_dataset_reads_it_back():
     np.testing.assert_allclose(found, rot_z(yaw) @ shift[1], atol=1e-9)
 
     stacked = jax.tree.map(lambda x: np.asarray(x)[None], walked)
-    data, _ = make_dataset(LEARNS_TOUCHDOWNS, stacked)
+    data, _ = make_dataset(model.LEARNS_TOUCHDOWNS, stacked)
     assert data.lands.sum(axis=0).tolist() == [1, 1]
     foot = np.nonzero(data.lands)[1]
     np.testing.assert_allclose(data.touchdown_error[data.lands], shift[foot], atol=1e-9)
@@ -145,17 +136,12 @@ def test_gradient_over_50_ticks_is_that_of_differences():
 
 @pytest.fixture
 def cases():
-    """Random weights for each trajectory, with phi the identity and the net."""
-    net = small_effect()  # part of the answer, and of the same program as the plain rigid body
-    return [
-        (
-            (name, said),
-            random_weights(seed, nominal, 2.0),
-            Scenario(ROBOT, named_command(name), ANCHOR, effect),
-        )
-        for seed, name in enumerate(COMMANDS)
-        for said, effect in (("plain", PLAIN), ("net", net))
-    ]
+    """Random weights for each trajectory, with phi the identity and the net: of one program."""
+    effects, made = {"plain": PLAIN, "net": model.small_effect()}, []
+    for (seed, name), said in product(enumerate(COMMANDS), effects):
+        scenario = Scenario(ROBOT, named_command(name), ANCHOR, effects[said])
+        made.append(((name, said), random_weights(seed, nominal, 2.0), scenario))
+    return made
 
 
 @pytest.mark.slow
@@ -177,9 +163,6 @@ def test_a_walk_in_blocks_is_the_same_walk_with_the_same_gradient():
     assert float(parts.loss) == pytest.approx(float(whole.loss), rel=1e-12)
     for a, b in zip(jax.tree.leaves(parts.gradient), jax.tree.leaves(whole.gradient), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9)
-
-
-# Numbers of the controller beside Q and R
 
 
 @pytest.fixture(scope="module")

@@ -11,12 +11,8 @@ import pytest
 from model import ANCHOR, ROBOT, ROOT, SHORT, small_net
 from pretend import python
 
-from hector_jax.control.reference import named_command
-from hector_jax.control.weights import nominal
-from hector_jax.grfm.effect import last_command
-from hector_jax.grfm.network import as_effect
+from hector_jax import RolloutConfig, Scenario, as_effect, last_command, named_command, nominal
 from hector_jax.tuning.difftune import TuneConfig, tune
-from hector_jax.tuning.rollout import RolloutConfig, Scenario
 
 
 @pytest.fixture

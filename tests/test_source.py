@@ -150,7 +150,7 @@ def test_the_limit_of_a_motor_is_the_smallest_that_the_file_states(tmp_path):
     np.testing.assert_array_equal(model.actuator_ctrlrange[:, 1], [20, 20, 15, 20] * 2)
 
 
-def test_soles_stand_on_the_floor_with_their_spheres_alone(tmp_path):
+def test_soles_of_two_or_four_contacts_stand_on_the_floor_with_their_spheres_alone(tmp_path):
     description = small(tmp_path)
     model = build_spec(description).spec.compile()
     data, spheres = standing(model), set(contacts_of(description))
@@ -167,9 +167,6 @@ def test_soles_stand_on_the_floor_with_their_spheres_alone(tmp_path):
     assert model.geom_friction[colliding, 0].max() <= 0.2
     kinds = {mujoco.mjtGeom(int(kind)).name for kind in model.geom_type[colliding]}
     assert kinds == {"mjGEOM_SPHERE", "mjGEOM_BOX", "mjGEOM_CAPSULE"}
-
-
-def test_a_sole_may_have_four_contacts(tmp_path):
     corners = tuple((x, y, -0.04) for x in (0.07, -0.05) for y in (0.03, -0.03))
     flat = small(tmp_path, contacts=corners)
     names = [f"{side}_contact_{i}" for side in ("left", "right") for i in range(4)]
@@ -187,7 +184,7 @@ def test_a_keyframe_of_the_file_is_kept_when_joints_are_welded(tmp_path):
     np.testing.assert_array_equal(got.body_inertia, by_angles.body_inertia)
 
 
-def test_the_mass_of_a_urdf_is_that_of_all_its_links_whatever_is_drawn(tmp_path):
+def test_the_mass_of_a_urdf_is_that_of_all_its_links_and_one_beside_a_robot_is_left_out(tmp_path):
     drawn = '<visual><geometry><box size="0 0 0"/></geometry></visual></link>'
     urdf = urdf_of(mujoco.MjModel.from_xml_path(str(MODEL_PATH))).replace("</link>", drawn)
     held = LINK.replace("</i", '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></i')
@@ -195,9 +192,6 @@ def test_the_mass_of_a_urdf_is_that_of_all_its_links_whatever_is_drawn(tmp_path)
     masses = [float(x) for x in re.findall('<mass value="([^"]*)"', urdf)]
     model = compiled(by_numbers(tmp_path, urdf))
     assert model.body_mass.sum() == pytest.approx(sum(masses), rel=1e-12)
-
-
-def test_a_mass_beside_the_robot_is_left_out_and_told(tmp_path):
     lamp = '<body name="lamp"><geom size="1" mass="9" contype="0" conaffinity="0"/></body>'
     source = build_spec(small(tmp_path, more=f"<worldbody>{lamp}</worldbody>"))
     assert "left out, which no joint holds: lamp" in source.notes
@@ -218,13 +212,10 @@ def test_names_are_the_files_own_and_what_has_none_gets_one(tmp_path):
     ]
     path.write_text(replaced(path.read_text(), *changes))
     names = {"left_knee": "base", "right_ankle": "floor", "waist": "joint_5"}
-    renamed = replace(
-        description,
-        joints=tuple(names.get(x, x) for x in description.joints),
-        weld=("joint_5", "shoulder"),
-        standing=tuple((names.get(x, x), angle) for x, angle in description.standing),
-    )
-    got = compiled(renamed)
+    joints = tuple(names.get(x, x) for x in description.joints)
+    stands = tuple((names.get(x, x), angle) for x, angle in description.standing)
+    weld = ("joint_5", "shoulder")
+    got = compiled(replace(description, joints=joints, weld=weld, standing=stands))
     for name in ("body_mass", "body_inertia", "jnt_range", "key_qpos", "geom_size"):
         np.testing.assert_array_equal(getattr(got, name), getattr(expected, name))
     assert len({got.body(b).name for b in range(got.nbody)}) == got.nbody

@@ -7,36 +7,15 @@ import pytest
 from model import EXAMPLES, ROBOT
 from pretend import call, instead
 
+from hector_jax import InputError, Job, TuneConfig, hfs, named_command, walk
 from hector_jax.cli import arguments
-from hector_jax.control.controller import WalkConfig
-from hector_jax.control.gait import GaitConfig
-from hector_jax.control.reference import (
-    COMMANDS,
-    UNSEEN,
-    Command,
-    named_command,
-    reference_at,
-    standing_anchor,
-)
+from hector_jax.control import GaitConfig, WalkConfig, expert, nominal
+from hector_jax.control.reference import COMMANDS, UNSEEN, Command, reference_at, standing_anchor
 from hector_jax.control.trajectories import beyond, command_of, limits
-from hector_jax.control.weights import expert, nominal
-from hector_jax.core.inputs import InputError
 from hector_jax.sim import walk as sim_walk
-from hector_jax.sim.loop import Job
-from hector_jax.sim.walk import walk
-from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import TuneConfig
 
 SLALOM = EXAMPLES / "slalom.toml"
 LIMITS = limits(ROBOT, GaitConfig())
-
-
-def test_the_example_is_a_command_of_six_seconds_that_ends_as_it_began():
-    found = command_of(str(SLALOM))
-    assert (found.name, found.seconds) == ("slalom", 6.0)
-    np.testing.assert_array_equal(found.command.velocity[-1], [0.2, 0.1])
-    end = reference_at(0.01, found.command, standing_anchor(ROBOT), 600.0)
-    assert end.euler[2] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_the_limits_are_those_that_the_robot_was_seen_to_have():
@@ -69,9 +48,6 @@ def test_what_is_beyond_the_limits_is_told_by_segment_value_and_range(rows, told
     assert re.search(told, said)
 
 
-# On the command line
-
-
 def test_a_walk_is_as_long_as_its_file_says_and_limits_are_told(monkeypatch, capsys, tmp_path):
     walks = []
 
@@ -93,9 +69,14 @@ def test_a_walk_is_as_long_as_its_file_says_and_limits_are_told(monkeypatch, cap
     assert walks == [6.0, 4.0, 1.0]
 
 
-def test_rollouts_are_as_long_as_the_file_says():
+def test_the_example_is_a_command_of_six_seconds_that_ends_as_it_began_and_rollouts_are_as_long():
+    found = command_of(str(SLALOM))
+    assert (found.name, found.seconds) == ("slalom", 6.0)
+    np.testing.assert_array_equal(found.command.velocity[-1], [0.2, 0.1])
+    end = reference_at(0.01, found.command, standing_anchor(ROBOT), 600.0)
+    assert end.euler[2] == pytest.approx(0.0, abs=1e-9)
     config = TuneConfig()
-    assert arguments.with_length(config, command_of(str(SLALOM))).rollout.ticks == 600
+    assert arguments.with_length(config, found).rollout.ticks == 600
     assert arguments.with_length(config, command_of("c")) == config
 
 

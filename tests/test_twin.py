@@ -11,16 +11,12 @@ import pytest
 from model import AHEAD, ANCHOR, EXAMPLES, HEIGHT, PLAIN, ROBOT
 from pretend import call
 
+from hector_jax import InputError, State, expert, load_robot, named_command
 from hector_jax.control.contact import BOX_FRICTION, TWIST, Constraint
 from hector_jax.control.controller import WalkConfig, plan, plan_horizon, walk_config
 from hector_jax.control.footstep import Feet
 from hector_jax.control.mpc import MpcConfig
-from hector_jax.control.reference import named_command
 from hector_jax.control.twin import FROM_ROBOT, FROZEN, PATH, ReferenceInputs, TwinConfig
-from hector_jax.control.weights import expert
-from hector_jax.core.inputs import InputError
-from hector_jax.core.trajectory import State
-from hector_jax.robot.model import load_robot
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout, rollout_config
 
 OWN = EXAMPLES / "own_controller"
@@ -48,7 +44,7 @@ def twin(**changes):
     return WalkConfig(twin=TwinConfig(**changes))
 
 
-def test_a_reference_from_the_robot_starts_at_it_and_goes_on_with_the_command():
+def test_a_reference_from_the_robot_starts_at_it_and_keeps_to_the_path_where_nothing_moves():
     motion = ReferenceInputs(named_command("c"), ANCHOR, jnp.arange(0, 33, 3), STATE)
     ahead = FROM_ROBOT.of(0.01, motion)
     np.testing.assert_allclose(ahead.position[0], [1.0, 2.0, HEIGHT], atol=1e-15)
@@ -60,9 +56,6 @@ def test_a_reference_from_the_robot_starts_at_it_and_goes_on_with_the_command():
     path = PATH.of(0.01, motion)
     np.testing.assert_allclose(path.ang_velocity, ahead.ang_velocity)
     np.testing.assert_allclose(path.position[0], [*ROBOT.com_offset[:2], HEIGHT], atol=1e-12)
-
-
-def test_what_the_command_leaves_at_rest_keeps_to_the_path():
     path, robot, both = (
         horizon(twin(**changes)).reference
         for changes in ({}, {"reference": FROM_ROBOT}, {"reference": FROM_ROBOT, "at_rest": 0.2})
@@ -74,20 +67,14 @@ def test_what_the_command_leaves_at_rest_keeps_to_the_path():
     assert abs(both.position[0, 1] - path.position[0, 1]) < 0.01
 
 
-def test_the_target_of_a_late_step_is_that_of_the_step_before():
+def test_late_targets_frozen_linearisations_and_contacts_at_a_share_of_a_step_are_as_asked_for():
     on_time, late = (horizon(twin(late=late)).reference for late in (0, 1))
     for now, then in zip(on_time, late, strict=True):
         np.testing.assert_array_equal(then[1:], now[:-1])
-
-
-def test_a_frozen_linearisation_is_that_of_the_present_in_all_steps():
     found = horizon(twin(linearisation=FROZEN))
     np.testing.assert_allclose(found.euler, np.tile(STATE.euler, (10, 1)))
     np.testing.assert_allclose(found.lever, np.tile(FEET.position - STATE.position, (10, 1, 1)))
     np.testing.assert_allclose(found.foot_yaw, 0.2)
-
-
-def test_contacts_are_those_at_the_share_of_a_step_that_is_asked_for():
     # steps of 3 ticks from tick 18 on; the feet change at 20 and at 40, within the step from 39 on
     begin, middle = (horizon(twin(contact_at=x), 18).contact[:, 0] for x in (0.0, 0.5))
     np.testing.assert_array_equal(np.flatnonzero(begin != middle), [7])
@@ -188,14 +175,11 @@ def test_a_twin_of_another_kind_is_told_where_it_differs(walked, tmp_path, monke
         assert told in lines
 
 
-def test_a_twin_file_is_read_as_a_robots():
-    config = walk_config(load_robot(OWN / "twin.toml"))
+def test_a_twin_file_is_read_as_a_robots_and_nothing_is_said_of_its_motors(monkeypatch, capsys):
+    config = walk_config(robot := load_robot(OWN / "twin.toml"))
     assert config.twin == TwinConfig(FROM_ROBOT, linearisation=FROZEN, contact_at=0.0, plan_ticks=2)
     assert config.plan_interval == pytest.approx(0.01)
-    assert rollout_config(load_robot(OWN / "twin.toml")).ticks == 800  # 4 s
-
-
-def test_nothing_is_said_of_the_motors_of_a_twin_whose_legs_are_anothers(monkeypatch, capsys):
+    assert rollout_config(robot).ticks == 800  # 4 s
     assert call(monkeypatch, "robot", OWN / "twin.toml") == 0
     lines = capsys.readouterr().out
     assert "own_controller: 12 kg" in lines

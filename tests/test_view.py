@@ -25,12 +25,11 @@ from hector_jax.grfm.network import save_net
 from hector_jax.report import fidelity, pictures, view
 from hector_jax.report.motion import motion
 from hector_jax.report.view import ViewedWalk, arrows
-from hector_jax.store import folder as runs
+from hector_jax.store import run as runs
 from hector_jax.store.cache import robot_hash
 
 
 def viewed(seed=0, **kwargs):
-    """A pretended walk."""
     walk = pretend_walk(seed, **kwargs)
     return ViewedWalk(walk, {"commanded": walk.command, "measured": walk.effect})
 
@@ -90,7 +89,7 @@ def test_both_walks_stand_on_one_reference_wherever_they_began():
 def test_metrics_of_a_run_that_goes_on_are_read_and_its_newest_weights_taken(tmp_path):
     run = pretend_run(tmp_path)
     write_metrics(run, 6, refused=(3,))
-    found = runs.read_histories(run)
+    found = runs.Run(run).histories
     again = [runs.as_row(name, i) for name, history in found.items() for i in history]
     write_rows(tmp_path / "again", again)
     assert (tmp_path / "again").read_bytes() == (run / "metrics.jsonl").read_bytes()
@@ -99,7 +98,7 @@ def test_metrics_of_a_run_that_goes_on_are_read_and_its_newest_weights_taken(tmp
     assert np.isnan(curve[3])
     assert curve[6] < curve[0] == 100.0
     for expected, words in ((nominal(), "with at iteration 6, so far"), (expert(), "with")):
-        weights, told = runs.weights_of(run, "with")
+        weights, told = runs.Run(run).weights("with")
         np.testing.assert_array_equal(weights_to_vector(weights), weights_to_vector(expected))
         assert told == words
         save_weights(run / "weights" / "with.json", expert())
@@ -134,8 +133,8 @@ def page(request):
     server.stop()
 
 
-def test_the_page_answers_its_own_origins_only(page):
-    import viser
+def test_the_page_answers_its_own_origins_only_and_no_client_opens_a_tunnel(page, monkeypatch):
+    import viser._viser
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
 
@@ -151,11 +150,6 @@ def test_the_page_answers_its_own_origins_only(page):
     assert all(map(opens, [None, *own]))
     foreign = "https://evil.example", f"http://evil.example:{page[2]}", "http://localhost:1", "null"
     assert not any(map(opens, foreign))
-
-
-def test_no_client_of_the_page_opens_a_tunnel(page, monkeypatch):
-    import viser._viser
-
     opened = []
     monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *_: opened.append(1))
     assert page[0].request_share_url() is None  # what a client's message calls
@@ -179,7 +173,6 @@ def test_only_the_net_of_the_run_predicts(monkeypatch, capsys, tmp_path, own):
 
 
 def until(seconds, seen):
-    """Ask again until it is seen."""
     end = time.monotonic() + seconds
     while not seen():
         assert time.monotonic() < end, f"not seen within {seconds} s"

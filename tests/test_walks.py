@@ -1,4 +1,4 @@
-"""Tuning on walks: the folder, the logs, falls, and files against walks in process.
+"""Tuning on walks: budget, folder, logs, falls, and files against walks in process.
 
 The first stories are of walks of five ticks, compiled once for all of them; the others of a toy, a
 quadratic in log-weights whose optimum is another in each case.
@@ -11,39 +11,30 @@ from dataclasses import replace
 from functools import partial
 
 import jax
+import model
 import numpy as np
 import pytest
-from model import AHEAD, BRIEF, vector
+from model import AHEAD, BEST_OTHERS, BRIEF, ROBOT, vector
 from pretend import HandsOver, files
 
-from hector_jax.control.reference import named_command
-from hector_jax.control.weights import (
-    directions,
-    expert,
-    nominal,
-    vector_to_weights,
-    weights_to_vector,
-)
+from hector_jax import InputError, Job, TuneConfig, hfs, load_robot, named_command, nominal, walk
+from hector_jax.cli import arguments
+from hector_jax.control.parameters import GROUPS
+from hector_jax.control.weights import directions, expert, vector_to_weights, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights
-from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import save_tree
 from hector_jax.own import walk_log
-from hector_jax.robot.model import load_robot
 from hector_jax.sim.engine import MUJOCO_C
-from hector_jax.sim.loop import Job
-from hector_jax.sim.walk import walk
-from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
-from hector_jax.tuning.loss import loss_of
-from hector_jax.walk_tuning import added_logs, walks
+from hector_jax.tuning.loss import alphas, loss_of
+from hector_jax.walk_tuning import added_logs, best_set, walks
 from hector_jax.walk_tuning import campaign as campaigns
 from hector_jax.walk_tuning.best_set import drawn_plants
 
 # all walks of this file are of these ticks and this command: one set of programs for all tests
 CONFIG, COMMAND, SECONDS = TuneConfig(rollout=BRIEF, least_gain=1e-6), {"short": AHEAD}, 0.05
-SETS, POOL = 3, HandsOver()
+SETS, POOL, ANOTHER_ROBOT = 3, HandsOver(), "made for another robot of this name"
 
 
 @pytest.fixture(scope="module")
@@ -52,23 +43,16 @@ def robot():
 
 
 def campaign(folder, robot, plants=(None,), **others):
-    return campaigns.Campaign(
-        **{"folder": folder, "config": CONFIG, "robot": robot, "start": nominal(robot)}
-        | {"commands": COMMAND, "plants": plants}
-        | others
-    )
+    own = {"folder": folder, "config": CONFIG, "robot": robot, "start": nominal(robot)}
+    return campaigns.Campaign(**own | {"commands": COMMAND, "plants": plants} | others)
 
 
 def same(a, b):
-    """Whether two trees are equal to the last bit."""
     return jax.tree.all(jax.tree.map(np.array_equal, a, b))
 
 
 def same_sets(a, b):
     return len(a) == len(b) and all(map(same, a, b))
-
-
-# On the simulator
 
 
 @pytest.fixture(scope="module")
@@ -131,8 +115,6 @@ def test_the_reference_of_a_log_is_that_of_its_walk(robot):
     assert seen.loss == pytest.approx(float(loss_of(CONFIG.loss, walked)), rel=1e-9)
 
 
-# On a toy
-
 NOMINAL = np.asarray(weights_to_vector(nominal()))
 LOG = walk_log.log_of(no_samples(10, 2))  # one without samples: the toy needs none
 WALKED = []  # case and weights of the walks of `toy_case`
@@ -165,7 +147,6 @@ def as_weights(vector):
 
 
 def toy_case(campaign, weights, case):
-    """A walk of the toy."""
     WALKED.append((case, weights))
     return walk_log.ScoredLog(toy_loss(weights, case), LOG)
 
@@ -323,9 +304,6 @@ def test_the_walks_count_where_the_code_would_now_step_elsewhere(toy):
     assert found.sets[1].losses[0] == pytest.approx(toy_loss(elsewhere, 0))
 
 
-# Falls
-
-
 def test_a_fall_is_a_bounded_loss_of_its_case_and_has_no_slope(toy):
     """Of e times the largest at the start; no loss counts as more."""
     one, at = toy(cases=3), nominal()
@@ -405,24 +383,17 @@ def test_from_a_start_that_falls_in_all_cases_nothing_is_tuned_and_in_one_it_is(
     assert found.rows[found.best]["change"] < -90.0
 
 
-# Whose folder it is
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (lambda one: {"plants": drawn_plants(one.robot, 3, first_seed=1)}, "made with plants "),
-        (
-            lambda one: {"robot": one.robot._replace(mass=np.asarray(13.0))},
-            "made for another robot of this name",
-        ),
+        (lambda one: {"robot": one.robot._replace(mass=np.asarray(13.0))}, ANOTHER_ROBOT),
         (lambda one: {"start": expert()}, "made with start "),
         (lambda one: {"commands": {"short": named_command("c")}}, "made with commands "),
         (lambda one: {"config": replace(CONFIG, ridge=0.1)}, "made with settings "),
         (lambda one: {"config": replace(CONFIG, least_gain=0.1)}, "made with settings "),
         (lambda one: {"config": replace(CONFIG, others=("turn_lead",))}, "made with "),
     ],
-    ids=["plants", "robot", "start", "commands", "ridge", "least_gain", "others"],
 )
 def test_the_record_of_another_tuning_is_refused_in_one_line(toy, change, words):
     walks.tune_on_walks(HERE, one := toy(), walks=3)
@@ -433,7 +404,7 @@ def test_the_record_of_another_tuning_is_refused_in_one_line(toy, change, words)
     assert files(one.folder) == before
 
 
-def test_a_record_or_a_log_that_is_damaged_is_refused_in_one_line(toy):
+def test_a_record_a_log_or_weights_that_are_damaged_or_others_are_refused_in_one_line(toy):
     walks.tune_on_walks(HERE, one := toy(), walks=6)
     log, record = one.folder / "logs" / "1-0.npz", one.folder / "walks.jsonl"
     whole = log.read_bytes()
@@ -445,13 +416,69 @@ def test_a_record_or_a_log_that_is_damaged_is_refused_in_one_line(toy):
     record.write_text("\n".join([lines[0], "{", ""]))
     with pytest.raises(InputError, match=r"walks.jsonl, line 2: a row of a tuning on walks"):
         walks.tune_on_walks(HERE, one, walks=6)
-
-
-def test_weights_in_the_folder_that_have_other_numbers_are_refused_in_one_line(toy):
-    walks.tune_on_walks(HERE, one := toy(), walks=6)
+    record.write_text("\n".join([*lines, ""]))
     path = walks.weights_path(one.folder, 1)
     wide = load_weights(path)._replace(others={"footstep_width": np.array(0.07)})
     save_weights(path, wide)
     words = "1.json: others must be those of the start, none; got footstep_width"
     with pytest.raises(InputError, match=words):
         walks.tune_on_walks(HERE, one, walks=6)
+
+
+def masses(plants):
+    return [float(plant.mass) for plant in plants]
+
+
+# flags, commands, and the plants and walks: four sets, none beside the hfs, or eight sets
+BUDGETS = [
+    (None, None, 1, 12, 48),
+    (None, None, 3, 12, 144),
+    (2, None, 1, 2, 8),
+    (0, None, 1, 1, 4),
+]
+BUDGETS += [(None, 0, 1, 1, 0), (None, 2, 1, 1, 2), (None, 40, 1, 5, 40), (None, 36, 3, 1, 36)]
+BUDGETS += [(None, 100_000, 1, 16, 100_000), (3, 24, 2, 3, 24)]
+
+
+@pytest.mark.parametrize("budget", BUDGETS)
+def test_a_budget_is_four_sets_on_twelve_plants_or_eight_on_more(budget):
+    *given, plants, walks = budget
+    found, all_walks = best_set.walk_plants(ROBOT, *given)
+    assert (len(found), all_walks) == (plants, walks)
+    if given[0] == 0:
+        same = jax.tree.map(np.array_equal, found, [hfs(ROBOT.description)])
+        assert jax.tree.all(same)
+    else:  # a larger budget begins with the same plants
+        assert masses(found) == masses(best_set.drawn_plants(ROBOT, 16)[:plants])
+        assert len(set(masses(found))) == plants
+
+
+def test_plants_of_a_tuning_are_none_that_judge_it():
+    standin = masses(arguments.plants("standin", range(32), ROBOT.description))
+    assert not {*standin} & {*masses(best_set.drawn_plants(ROBOT, 1000))}
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ((None, 1, 1), "at least 2 (1 command on 1 plant, twice), got 1"),
+        ((None, 5, 3), "at least 6 (3 commands on 1 plant, twice), got 5"),
+        ((8, 15, 1), "at least 16 (1 command on 8 plants, twice), got 15"),
+        ((0, 3, 2), "at least 4 (2 commands on 1 plant, twice), got 3"),
+    ],
+)
+def test_a_budget_with_which_no_second_set_walks_is_one_line(given, words):
+    with pytest.raises(InputError) as error:
+        best_set.walk_plants(ROBOT, *given)
+    assert str(error.value) == f"--walks must be 0 or {words}"
+
+
+def test_best_is_tuned_with_numbers_of_its_own_and_smoothly_where_asked():
+    start = nominal()._replace(others={"footstep_width": np.array(0.09)})
+    config, at = best_set.settings_of_best(model.CONFIG, ROBOT, start, smooth=3.0, safe=0.05)
+    assert at.others == {**BEST_OTHERS, "position_limit": 0.05, "footstep_width": 0.09}
+    before = alphas(model.CONFIG.loss)
+    assert alphas(config.loss) == {**before, "L_between": 3.0 * before["L_ctrl"]}
+    assert config.others == GROUPS["integral"]
+    assert config.rollout == model.CONFIG.rollout
+    jax.tree.map(np.testing.assert_array_equal, at[:2], start[:2])

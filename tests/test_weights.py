@@ -5,34 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hector_jax.control.controller import WalkConfig
-from hector_jax.control.mpc import MpcConfig
+from hector_jax import nominal
+from hector_jax.control import MpcConfig, WalkConfig, Weights, expert
+from hector_jax.control import weights as control_weights
 from hector_jax.control.parameters import TUNABLES, bounds
-from hector_jax.control.weights import (
-    Weights,
-    between,
-    direction_names,
-    directions,
-    expert,
-    nominal,
-    scale_weights,
-    vector_to_weights,
-    weight_names,
-    weights_to_vector,
-)
-
-
-def test_each_name_stands_where_its_weight_is():
-    numbers = dict(zip(weight_names(), range(24), strict=True))
-    weights = vector_to_weights(jnp.arange(24.0))
-    assert weights.Q.euler[2] == numbers["Q_yaw"]
-    assert weights.Q.position[0] == numbers["Q_x"]
-    assert weights.Q.ang_velocity[1] == numbers["Q_wy"]
-    assert weights.Q.velocity[2] == numbers["Q_vz"]
-    assert weights.R.force[0, 2] == numbers["R_Fz_left"]
-    assert weights.R.force[1, 0] == numbers["R_Fx_right"]
-    assert weights.R.moment[1, 1] == numbers["R_My_right"]
-    assert len(set(weight_names())) == 24
+from hector_jax.control.weights import vector_to_weights, weight_names, weights_to_vector
 
 
 @pytest.mark.parametrize("shape", [(24,), (3, 24), (2, 5, 24)])
@@ -54,13 +31,23 @@ def test_named_weights_lie_inside_the_box_and_treat_both_feet_alike(weights):
         np.testing.assert_array_equal(kind[0], kind[1])
 
 
-def test_the_feet_share_their_weights_in_every_direction():
-    steps = directions()
-    assert len(direction_names()) == len(steps) == 18
+def test_each_name_stands_where_its_weight_is_and_feet_share_theirs_in_every_direction():
+    numbers = dict(zip(weight_names(), range(24), strict=True))
+    weights = vector_to_weights(jnp.arange(24.0))
+    assert weights.Q.euler[2] == numbers["Q_yaw"]
+    assert weights.Q.position[0] == numbers["Q_x"]
+    assert weights.Q.ang_velocity[1] == numbers["Q_wy"]
+    assert weights.Q.velocity[2] == numbers["Q_vz"]
+    assert weights.R.force[0, 2] == numbers["R_Fz_left"]
+    assert weights.R.force[1, 0] == numbers["R_Fx_right"]
+    assert weights.R.moment[1, 1] == numbers["R_My_right"]
+    assert len(set(weight_names())) == 24
+    steps = control_weights.directions()
+    assert len(control_weights.direction_names()) == len(steps) == 18
     assert (steps.sum(axis=0) == 1).all()
     step = np.zeros(18)
-    step[direction_names().index("R_Fz")] = np.log(2.0)
-    weights = scale_weights(nominal(), step)
+    step[control_weights.direction_names().index("R_Fz")] = np.log(2.0)
+    weights = control_weights.scale_weights(nominal(), step)
     np.testing.assert_allclose(weights.R.force[:, 2], 2.0 * nominal().R.force[:, 2])
     np.testing.assert_allclose(weights.R.force[:, :2], nominal().R.force[:, :2])
 
@@ -68,13 +55,13 @@ def test_the_feet_share_their_weights_in_every_direction():
 def test_between_two_sets_weights_are_geometric_means_and_other_numbers_lie_on_a_line():
     one, other = (w._replace(others={"turn_lead": x}) for w, x in ((nominal(), 0), (expert(), 1)))
     for share, end in ((0.0, one), (1.0, other)):
-        jax.tree.map(np.testing.assert_allclose, between(one, other, share), end)
-    third = between(one, other, 1 / 3)
+        jax.tree.map(np.testing.assert_allclose, control_weights.between(one, other, share), end)
+    third = control_weights.between(one, other, 1 / 3)
     assert third.others == {"turn_lead": pytest.approx(1 / 3)}
     cubes = weights_to_vector(nominal()) ** 2 * weights_to_vector(expert())
     np.testing.assert_allclose(weights_to_vector(third) ** 3, cubes, rtol=1e-12)
     points = Weights(nominal().Q, nominal().R._replace(moment=np.zeros((2, 0))))
-    assert between(points, points).R.moment.shape == (2, 0)
+    assert control_weights.between(points, points).R.moment.shape == (2, 0)
 
 
 def test_each_number_beside_the_weights_has_its_box_and_its_default_inside():

@@ -38,7 +38,7 @@ def main(folder: Path) -> None:
         tick = whole(int(walk[f"{at}.tick"]))
         anchor = np.concatenate([walk[f"{at}.position"], [walk[f"{at}.yaw"]], tick])
         inputs = [ctypes.c_void_p(x.ctypes.data) for x in (estimate, command, anchor, output)]
-        unsolved += call.controller_step(memory, ctypes.c_int64(ms), *inputs) not in (0, 5)
+        unsolved += call.controller_step_at(memory, ctypes.c_int64(ms), *inputs) not in (0, 5)
         worst = np.maximum(worst, np.abs(output[: expected.shape[1]] - expected[ms]).max())
     print(f"{len(expected)} calls, largest difference {worst:.1e} N m; not solved: {unsolved}")
 

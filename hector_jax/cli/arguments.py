@@ -41,8 +41,6 @@ from hector_jax.sim.engine import MUJOCO_C, Engine, choose_engine
 from hector_jax.sim.loop import Job, check_plant
 from hector_jax.sim.standin import FAMILIES
 from hector_jax.sim.world import Imperfections, named_world
-from hector_jax.store.cache import robot_hash
-from hector_jax.store.folder import RunRequest
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.verdict import judging
 from hector_jax.verdict.metrics import family_of
@@ -135,19 +133,6 @@ def data_folder(folder: Path, path: Path | None, robot: Robot) -> Path:
         if first is not None and read_card(first)["robot"] not in (None, own):
             return apart
     return named
-
-
-def robot_of_run(run: Path, request: RunRequest) -> Robot:
-    """Load the robot that a run was tuned for.
-
-    Raises:
-        InputError: its files have changed since.
-    """
-    robot = load_robot(request.robot)
-    if request.body != robot_hash(robot):
-        path = robot.description.path
-        raise InputError(f"{run} was tuned for another robot: {path} or its MJCF has changed")
-    return robot
 
 
 def flag_folder(args: Collect | Train, name: str, robot: Robot) -> Path:

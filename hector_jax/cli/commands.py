@@ -6,11 +6,24 @@ from functools import partial, singledispatch
 from pathlib import Path
 from typing import Any
 
-from hector_jax.cli import arguments, doctor, evaluate, flags, propose, tune, view, walk, walker
+from hector_jax.cli import (
+    arguments,
+    doctor,
+    evaluate,
+    flags,
+    foretell,
+    propose,
+    tune,
+    view,
+    walk,
+    walker,
+)
 from hector_jax.cli.arguments import print_result
 from hector_jax.control.controller import walk_config
+from hector_jax.control.tagged_file import keys_file, read_own, with_weights
 from hector_jax.control.twin import TwinConfig
 from hector_jax.control.weights import nominal
+from hector_jax.control.weights_file import weights_tree
 from hector_jax.core.console import say
 from hector_jax.core.files import locked, write_file
 from hector_jax.core.inputs import InputError
@@ -22,10 +35,10 @@ from hector_jax.grfm.training import TrainConfig
 from hector_jax.importing.propose import RobotProposal, propose_robot, standard_form
 from hector_jax.importing.remarks import differences, remarks
 from hector_jax.importing.table import changes_of_model, section, table_of
-from hector_jax.robot.model import load_robot
+from hector_jax.robot.model import Robot, load_robot
 from hector_jax.sim import margin
 from hector_jax.store import nets
-from hector_jax.store.folder import read_request, robot_file
+from hector_jax.store.run import Run
 from hector_jax.tuning.loss import loss_of_robot
 
 
@@ -42,6 +55,7 @@ def run(args: Any) -> None:
 for _command in (
     doctor.run_doctor,
     evaluate.run_evaluate,
+    foretell.run_foretell,
     walk.run_walk,
     walk.run_grfm,
     walker.run_check,
@@ -147,33 +161,26 @@ def _write_robot(out: Path, proposal: RobotProposal, comments: Sequence[str], fi
 
 @run.register
 def run_export(args: flags.Export) -> None:
-    """Export the controller of a run, checked against the live one; or fill a template."""
-    is_run = args.run.is_dir()
-    path = export.find_weights(args.run, args.set)
-    folder = args.out or (args.run if is_run else args.run.parent) / "export"
-    if args.template:
-        out = folder / args.template.name.removesuffix(".j2")
-        if out.resolve() == args.template.resolve():
-            raise InputError(f"--template {out} would be overwritten; name it {out.name}.j2")
-        robot = load_robot(args.robot or (robot_file(args.run) if is_run else None))
-        weights = arguments.weights_by_name(str(path), robot)
-        write_file(out, fill_template(args.template, weights).encode())
+    """Export the controller of a run, checked against the live one; or numbers of a file."""
+    run = Run(args.run) if args.run.is_dir() else None
+    path = run.weights_file(args.set) if run else args.run
+    folder = args.out or (args.run if run else args.run.parent) / "export"
+    if args.template or args.into:
+        out = _fill_in(args, folder, path, load_robot(args.robot or (run and run.robot_file)))
         print_result(args.json, {"file": str(out)}, lambda: None)
         say(f"{out} has the weights {path}")
         return
-    if is_run and args.robot:
+    if run and args.robot:
         raise InputError(f"--robot is for weights files; the run {args.run} names its own robot")
-    request = read_request(args.run) if is_run else None
-    config = export.controller_of_run(args.run) if is_run else None
-    robot = arguments.robot_of_run(args.run, request) if request else load_robot(args.robot)
-    text = request.trajectory if request else "straight"
+    robot = run.robot if run else load_robot(args.robot)
+    text = run.request.trajectory if run else "straight"
     trajectory = arguments.load_trajectory(text, robot)
-    name = f"{args.run.resolve().name}/{path.stem}" if is_run else path.stem
+    name = f"{args.run.resolve().name}/{path.stem}" if run else path.stem
     weights = arguments.weights_by_name(str(path), robot)
     say("exporting the controller and comparing it with the live one on a walk")
     with locked(folder):
         card = export.export(
-            config or walk_config(robot),
+            run.controller if run else walk_config(robot),
             robot,
             weights,
             trajectory.command,
@@ -184,6 +191,25 @@ def run_export(args: flags.Export) -> None:
         )
     print_result(args.json, card, lambda: _print_check(card["check"] or {}))
     say(f"the export is in {folder}")
+
+
+def _fill_in(args: flags.Export, folder: Path, weights_file: Path, robot: Robot) -> Path:
+    """Write a copy of a file of another program with the weights in it; return its path."""
+    weights = arguments.weights_by_name(str(weights_file), robot)
+    source = args.template or args.into
+    assert source is not None
+    out = folder / (source.name.removesuffix(".j2") if args.template else source.name)
+    if out.resolve() == source.resolve():
+        flag = "--template" if args.template else "--into"
+        raise InputError(f"{flag} {out} would be overwritten; write to another folder by --out")
+    if args.template:
+        write_file(out, fill_template(source, weights).encode())
+        return out
+    text = with_weights(source, read_own(source), weights_tree(weights))
+    write_file(out, text.encode(errors="surrogateescape"))
+    if keys := keys_file(source):  # with which the copy is read
+        write_file(folder / keys.name, keys.read_bytes())
+    return out
 
 
 def _print_check(check: Mapping[str, Any]) -> None:

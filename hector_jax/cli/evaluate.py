@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import fields
 from functools import partial
+from math import ceil
 from pathlib import Path
 from typing import NamedTuple, get_args
 
@@ -36,10 +37,11 @@ from hector_jax.sim.engine import Engine, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import Imperfections
 from hector_jax.store import tunings
-from hector_jax.store.folder import RESULT, load_run
+from hector_jax.store.run import Run
 from hector_jax.store.setup import Setup
 from hector_jax.verdict import judging
 from hector_jax.verdict.matrix import OWN, Column, Columns, cells_of
+from hector_jax.verdict.stopping import StoppingRule
 
 
 class PlantModel(NamedTuple):
@@ -59,6 +61,7 @@ class EvaluationPlan(NamedTuple):
     models: dict[str, PlantModel]
     columns: dict[Column, range]  # with the seeds of its plants
     engines: dict[str, Engine]
+    rule: StoppingRule | None  # None: all plants walk
 
     @property
     def differs(self) -> dict[str, str]:
@@ -77,16 +80,21 @@ def run_evaluate(args: Evaluate) -> None:
     with nullcontext() if out is None else locked(out):
         with workers(args.processes, args.cluster) as pool:
             setup = Setup(pool, tunings.tune_config(plan.robot), plan.robot)
-            columns = _walk(setup, plan, out / "scores" if out else None)
+            columns = _walk(setup, plan, out)
         cells = cells_of(columns)
         result = report.matrix_report(cells, plan.differs, plan.world)
+        stops: list[str] = []
+        if plan.rule:
+            result["stopping"] = report.stopping_result(columns, plan.columns)
+            stops = report.stopping_lines(result["stopping"])
+            result["claims"] = [*stops, *result["claims"]]
         if out is not None:
             result |= {"config": {"flags": as_table(args)}, "environment": made_with}
             report.write_matrix_report(out, cells, result, as_command("hector evaluate", args))
     world = next(iter(plan.engines.values())).title if args.walker else args.world
     print_text = partial(report.print_matrix, cells, result["claims"])
     if len(columns) == 1:
-        print_text = partial(print_tables, *columns.values(), world)
+        print_text = partial(print_tables, *columns.values(), world, more=stops)
     print_result(args.json, result, print_text)
     if out is not None:
         say(f"the report is {out / 'report.md'}")
@@ -97,11 +105,12 @@ def _compare(args: Evaluate) -> None:
     names = (flag.name for flag in fields(args) if flag.name not in ("runs", "json", "config"))
     if beside := [f"--{name.replace('_', '-')}" for name in names if args.is_given(name)]:
         raise InputError(f"--runs compares what has walked already, so not beside {beside[0]}")
-    finished = [folder for folder in args.runs if (folder / RESULT).exists()]
-    for folder in args.runs:
-        if finished and folder not in finished:
-            say(f"{folder} is left out: it is not a finished run")
-    comparison = compare_runs([load_run(folder) for folder in finished or args.runs])
+    runs = list(map(Run, args.runs))
+    finished = [run for run in runs if run.is_finished]
+    for run in runs:
+        if finished and run not in finished:
+            say(f"{run.folder} is left out: it is not a finished run")
+    comparison = compare_runs(finished or runs)
     print_result(args.json, comparison, partial(print_comparison, comparison))
 
 
@@ -131,8 +140,10 @@ def plan_of(args: Evaluate) -> EvaluationPlan:
         columns[column] = _seeds(args, args.other_seeds if columns else args.seeds)
     first = next(iter(columns.values()))[:1]
     _check_exact(engines, arguments.plants(args.world, first, robot.description))
-    sets = _sets(args, robot, trajectories, paired=len(columns) > 1 or args.out is not None)
-    return EvaluationPlan(robot, args.world, trajectories, sets, models, columns, engines)
+    paired = len(columns) > 1 or args.out is not None or args.until_clear
+    sets = _sets(args, robot, trajectories, paired=paired)
+    rule = _rule(args, sets, columns) if args.until_clear else None
+    return EvaluationPlan(robot, args.world, trajectories, sets, models, columns, engines, rule)
 
 
 def _engines(args: Evaluate) -> dict[str, Engine]:
@@ -208,12 +219,35 @@ def _sets(
     }
 
 
+def _rule(
+    args: Evaluate, sets: Mapping[str, Mapping[str, Weights]], columns: Mapping[Column, range]
+) -> StoppingRule:
+    """Return the rule by which plants stop to walk.
+
+    Raises:
+        InputError: some column has too few plants for any claim.
+    """
+    per_plant = sum(map(len, sets.values()))
+    claims = (per_plant - len(sets)) * len(columns)  # none about nominal
+    rule = StoppingRule(claims, batch=ceil(args.processes / per_plant))
+    for column, seeds in columns.items():
+        if len(seeds) < rule.fewest:
+            needs = (
+                f"--until-clear needs {rule.fewest} plants or more for {plural(claims, 'claim')}"
+            )
+            raise InputError(f"{needs}, got {len(seeds)} in {report.title_of(column)}")
+    return rule
+
+
 def _plan_text(plan: EvaluationPlan) -> str:
     """Describe the number of walks, the plants, and the differences between engines."""
     per_plant = sum(map(len, plan.sets.values()))
     walks = plural(per_plant * sum(map(len, plan.columns.values())), "walk")
     texts = [f"{report.title_of(column)} ({len(seeds)})" for column, seeds in plan.columns.items()]
-    parts = [f"{walks}: {per_plant} on each plant", f"plants: {', '.join(texts)}"]
+    parts = [
+        f"{'at most ' if plan.rule else ''}{walks}: {per_plant} on each plant",
+        f"plants: {', '.join(texts)}",
+    ]
     parts += [f"in {plan.engines[name].title} {text}" for name, text in plan.differs.items()]
     return "; ".join(parts)
 
@@ -226,8 +260,10 @@ def _walk(setup: Setup, plan: EvaluationPlan, folder: Path | None) -> Columns:
             _jobs(plan, column),
             title=f"walking in {report.title_of(column)}",
             where=f" in {report.title_of(column)}" * (len(plan.columns) > 1),
+            rule=plan.rule,
             folder=folder,
             engine=plan.engines[column.engine],
+            about={"world": plan.world, "model": column.model},
         ).verdict
         for column in plan.columns
     }

@@ -249,7 +249,7 @@ class Evaluate(Configured, ForRobot, ByWalker, Parallel, Printed):
     Example: hector evaluate --weights nominal expert with=runs/tuned --traj all --plant light heavy
     """
 
-    usual = frozenset("weights runs traj world engine plant seeds robot out".split())
+    usual = frozenset("weights runs traj world engine plant seeds until_clear robot out".split())
     # nominal, expert, best, weights files, folders of straight.json, c.json, ...; or NAME=one
     weights: tuple[WeightSets, ...] = BASELINES
     runs: tuple[Run, ...] = ()  # instead: finished runs of `hector tune`, side by side
@@ -262,6 +262,8 @@ class Evaluate(Configured, ForRobot, ByWalker, Parallel, Printed):
     seeds: Plants = 8  # number of plants of the first model, in the first engine
     other_seeds: Plants = 8  # number of plants of each other model and engine
     first_seed: Seed = 0  # first plant
+    # stop before the last plant if every set is clearly better, worse or no different
+    until_clear: bool = False
     seconds: Seconds = 4.0  # length of each walk [s]; a whole eight takes 8
     # folder for a report; a later call continues there
     out: Annotated[Path | None, PathKind.FOLDER] = None
@@ -309,6 +311,20 @@ class Twin(Check, ByPlanner):
 
 
 @_command
+class Foretell(ForRobot, ByPlanner, Printed):
+    """Foretell from logs of walks what other weights would bring on the robot that walked.
+
+    Example: hector log foretell mine.npz --walked nominal --weights expert best
+    """
+
+    logs: tuple[Annotated[Path, PathKind.FILE], ...]  # of one robot and one trajectory
+    walked: Weights = "nominal"  # with which they were walked: a file, nominal, expert or best
+    weights: tuple[Weights, ...] = ("best",)  # that are foretold
+    traj: Trajectory = "straight"  # that was walked: a name or a TOML file
+    seconds: Seconds = 4.0  # length of the walks [s]
+
+
+@_command
 class Robot(Flags):
     """Report what a robot's model holds and what is wrong with it, and propose its TOML file.
 
@@ -341,7 +357,9 @@ class Export(Printed):
     seconds: Seconds = 1.0  # length of the walk of its check after the start-up [s]
     prefix: str = "controller"  # of the C program's files and names, for two in one program
     robot: RobotFile = None  # TOML file, with a weights file; HECTOR by default
-    # write no controller, but fill this file of numbers of another one: {{ Q.euler[0] }}, ..
+    # write no controller, but a copy of this file of another one with the weights at its tags
+    into: Annotated[Path | None, PathKind.FILE] = None
+    # the same of a file with formulas: {{ Q.euler[0] }}, ..
     template: Annotated[Path | None, PathKind.FILE] = None
 
 

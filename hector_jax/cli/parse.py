@@ -42,6 +42,7 @@ OVERVIEW = {
     "Tune on the walks of a robot, or of a simulator elsewhere": {
         "log check": "what of the log of a walk no weights can mend",
         "log twin": "how far the plans of a robot's file are from those of a log",
+        "log foretell": "what other weights would bring on the robot of a log",
         "propose": "the weights to walk with next",
         "log add": "take the logs of these walks",
     },

@@ -21,7 +21,7 @@ from hector_jax.core.runtime import workers
 from hector_jax.own import walk_log
 from hector_jax.robot.model import load_robot
 from hector_jax.store import tunings
-from hector_jax.store.folder import CONFIG
+from hector_jax.store.run import CONFIG
 from hector_jax.walk_tuning import added_logs, best_set, walks
 from hector_jax.walk_tuning.campaign import Campaign
 

@@ -22,8 +22,8 @@ from hector_jax.core.settings import convert
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.store import tunings
 from hector_jax.store.cache import robot_hash
-from hector_jax.store.folder import CONFIG, VERSIONS, flattened, read_object
 from hector_jax.store.nets import COLLECTION_CODE, load_trained
+from hector_jax.store.run import CONFIG, VERSIONS, Run, flattened
 from hector_jax.walk_tuning import best_set
 
 F = TypeVar("F", bound=Flags)
@@ -134,8 +134,8 @@ def resume(folder: Path, args: Tune) -> Tune:
         InputError: one line naming the file: no run, other flags, other code, another robot, or
             no data in this directory.
     """
-    path = folder / CONFIG
-    config, made_with = read_object(path), read_object(folder / VERSIONS)
+    path, run = folder / CONFIG, Run(folder)
+    config, made_with = run.config, run.made_with
     for name in ("robot", "code", "directory"):
         convert(config.get(name), str, name=f"{path}: {name}")
     remedy = f"{_REMEDY} ({made_with.get('commit', 'no commit is noted')})"
@@ -189,7 +189,7 @@ def note_settings(folder: Path, settings: dict[str, Any]) -> dict[str, Any]:
         InputError: they differ from those recorded when the run was begun.
     """
     path = folder / CONFIG
-    recorded, as_read = read_object(path), json.loads(as_json(settings))
+    recorded, as_read = Run(folder).config, json.loads(as_json(settings))
     if before := {name: recorded[name] for name in as_read if name in recorded}:
         check_settings(folder, flattened(before), flattened(as_read), _REMEDY)
     write_json(path, recorded | settings)

@@ -39,7 +39,7 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
 from hector_jax.store import nets, tunings
-from hector_jax.store.folder import METRICS, RESULT, VERSIONS
+from hector_jax.store.run import METRICS, RESULT, VERSIONS
 from hector_jax.store.setup import Setup
 from hector_jax.tuning.curvature import Determined, determined
 from hector_jax.tuning.difftune import TuneConfig, Tuning
@@ -212,12 +212,13 @@ def _check_start(run: _Run) -> None:
         InputError: the robot falls; the line has the likeliest cause and what to change.
     """
     setup, robot, text = run.setup, run.setup.robot, run.args.start
-    folder, at = run.folder / _ARTEFACTS / "hfs", text if text in BASELINES else "start"
+    folder, at = run.folder / _ARTEFACTS, text if text in BASELINES else "start"
+    options: dict[str, Any] = {"folder": folder, "about": {"world": "hfs"}}
     for name, command in run.commands.items():
         case = name, at, 0
         job = Job(run.start, command, hfs(robot.description), run.seconds)
         title = f"walking {name} with the weights to start from"
-        walks = judging.score_jobs(setup, {case: job}, title=title, folder=folder, with_walk=[case])
+        walks = judging.score_jobs(setup, {case: job}, title=title, with_walk=[case], **options)
         if walks[case][0].score.fallen:
             body, host_job = jax.tree.map(np.asarray, robot), on_host(job)
             falling = setup.pool.submit(fall_of, setup.config.rollout.walk, body, host_job)
@@ -286,11 +287,12 @@ def _walk_sets(run: _Run, sets: Mapping[str, Weights]) -> tuple[Judged, Judged]:
     """Walk all sets on the stand-in plants, and on the hfs."""
     seeds, description = range(run.args.seeds), run.setup.robot.description
     plants = arguments.plants("standin", seeds, description)
-    judge = partial(judging.judge, run.setup, sets, run.commands, seconds=run.seconds)
-    folder, title = run.folder / _ARTEFACTS, f"evaluating on {plural(len(seeds), 'stand-in plant')}"
-    standin = judge(plants, seeds, title=title, folder=folder / "standin")
+    options: dict[str, Any] = {"seconds": run.seconds, "folder": run.folder / _ARTEFACTS}
+    judge = partial(judging.judge, run.setup, sets, run.commands, **options)
+    title = f"evaluating on {plural(len(seeds), 'stand-in plant')}"
+    standin = judge(plants, seeds, title=title, about={"world": "standin"})
     title = "walking on the high-fidelity simulator"
-    on_hfs = judge([hfs(description)], [0], title=title, folder=folder / "hfs")
+    on_hfs = judge([hfs(description)], [0], title=title, about={"world": "hfs"})
     for name in run.commands:
         _say_worse(name, on_hfs.verdict.of_scene(name))
     return standin, on_hfs

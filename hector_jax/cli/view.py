@@ -18,7 +18,7 @@ from hector_jax.report.report import WORLDS
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import compile_model
 from hector_jax.store import nets
-from hector_jax.store.folder import read_histories, read_request, weights_of
+from hector_jax.store.run import Run
 from hector_jax.verdict import metrics
 
 
@@ -29,8 +29,8 @@ def run_view(args: View) -> None:
         require_package("viser", "view", "the page", " (--out writes a film without it)")
     else:
         check_film(folder / "film.mp4")
-    request = read_request(args.run)
-    robot = arguments.robot_of_run(args.run, request)
+    run = Run(args.run)
+    request, robot = run.request, run.robot
     command = arguments.load_trajectory(request.trajectory, robot)
     if folder is not None:
         if folder.resolve() == args.run.resolve():
@@ -39,7 +39,7 @@ def run_view(args: View) -> None:
     before, after = args.sets
     if not args.is_given("sets") and not (args.run / "weights" / f"{after}.json").exists():
         after = "with"  # `best` is chosen at the end of a run
-    sets = {name: weights_of(args.run, name, robot) for name in (before, after)}
+    sets = {name: run.weights(name, robot) for name in (before, after)}
     data = arguments.data_folder(request.data, request.robot, robot)
     net = request.net or nets.net_path(data, request.variant)
     effects = {}
@@ -71,7 +71,7 @@ def run_view(args: View) -> None:
         return titled(shown), description
 
     if folder is not None:
-        histories = read_histories(args.run)
+        histories = run.histories
         histories.pop("best", None)  # its loss has another term
         pictures.of_view(folder, robot, histories, request.loss, walk()[0])
         say(f"the film and the pictures are in {folder}")

@@ -18,7 +18,7 @@ from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
 from hector_jax.core.trajectory import FEET
-from hector_jax.own.log_check import check_log, read_check
+from hector_jax.own.log_check import check_log, read_check, unasked
 from hector_jax.own.parity import COMPONENTS, Parity, compare_plans
 from hector_jax.own.planner import (
     JUMP,
@@ -37,7 +37,7 @@ from hector_jax.robot.model import Robot, load_robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
 from hector_jax.store import tunings
-from hector_jax.store.folder import RESULT
+from hector_jax.store.run import RESULT
 from hector_jax.store.setup import Setup
 from hector_jax.verdict import judging, metrics
 from hector_jax.walk_tuning import best_set
@@ -52,6 +52,8 @@ def run_check(args: Check) -> None:
     seconds, config = arguments.walk_seconds(args, trajectory), walk_config(robot)
     log, end = read_check(args.log, robot, trajectory.command, seconds, config.gait.tick)
     lines = [*([end] if end else []), *check_log(log, config.plan_interval)]
+    if note := unasked(log):
+        say(note)
     text = "\n".join(lines or ["nothing is found that weights could not mend"])
     print_result(args.json, {"found": lines}, lambda: print(text))
 
@@ -169,8 +171,9 @@ def tune_walker(folder: Path, args: Tune) -> None:
         setup = Setup(pool, config, robot)
         options: dict[str, Any] = {
             "seconds": seconds,
-            "folder": folder / "scores",
+            "folder": folder,
             "engine": campaign.engine,
+            "about": {"world": "standin"},
         }
         for name, weights in compared.items():
             save_weights(folder / "weights" / f"{name}.json", weights)

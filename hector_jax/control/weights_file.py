@@ -1,13 +1,14 @@
-"""Weights as JSON files."""
+"""Weights in files: JSON, and tagged numbers of another program."""
 
 import json
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hector_jax.control.parameters import COST, TUNABLES, tunable
+from hector_jax.control.tagged_file import is_tagged, read_own, tagged_weights
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, unknown
@@ -59,12 +60,12 @@ def best(robot: Robot | None = None) -> Weights:
 
 
 def load_weights(path: Path, robot: Robot | None = None) -> Weights:
-    """Read weights that `save_weights` or a person wrote.
+    """Read weights that `save_weights` or a person wrote, or the tagged numbers of any file.
 
     Q and R have to be in the range `WEIGHTS`, `others` in their bounds in `TUNABLES`.
 
     Args:
-        path: JSON file.
+        path: JSON file, or one with tags (`tagged_file`).
         robot: the robot of the weights, HECTOR by default: R has a row for each of its feet, no
             moment of point feet (ignored if present), and gains have a number for each joint of a
             leg.
@@ -74,16 +75,22 @@ def load_weights(path: Path, robot: Robot | None = None) -> Weights:
             shape, or not a number in its range.
     """
     path, like = Path(path), nominal(robot)
-    tree = read_json(path, "weights", object_pairs_hook=_unique_keys)
     # shape and range of each entry
     parts = {
         part: {n: (w.shape, WEIGHTS) for n, w in getattr(like, part)._asdict().items() if w.size}
         for part in ("Q", "R")
     }
+    if is_tagged(path, text := read_own(path)):
+        known = {**parts, "others": _others(TUNABLES, robot)}
+        entries = {f"{part}.{n}": x for part, named in known.items() for n, x in named.items()}
+        tree = tagged_weights(path, text, entries)
+    elif path.suffix == ".json" or text.lstrip().startswith("{"):
+        tree = read_json(path, "weights", object_pairs_hook=_unique_keys)
+    else:
+        raise InputError(f"{path}: no JSON, and no number has a tag, as in `# hector: Q.euler[0]`")
     given = tree.get("others") if isinstance(tree, dict) else None
     costs = [n for n in given if n.startswith(COST)] if isinstance(given, dict) else []
-    numbers = {name: tunable(name) for name in (*TUNABLES, *costs)}
-    others = {n: (x.shape(robot), Range(x.lower, x.upper)) for n, x in numbers.items()}
+    others = _others((*TUNABLES, *costs), robot)
     _check_keys(path, tree, (*parts, "others", "$schema"), parts)  # a schema is for editors
     values = {}
     for part, entries in {**parts, "others": others}.items():
@@ -96,6 +103,11 @@ def load_weights(path: Path, robot: Robot | None = None) -> Weights:
             for name, value in given.items()
         }
     return Weights(State(**values["Q"]), like.R._replace(**values["R"]), values["others"])
+
+
+def _others(names: Iterable[str], robot: Robot | None) -> dict[str, tuple[tuple[int, ...], Range]]:
+    numbers = {name: tunable(name) for name in names}
+    return {n: (x.shape(robot), Range(x.lower, x.upper)) for n, x in numbers.items()}
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -66,7 +66,7 @@ def read_rows(
 
 def continue_journal(
     path: Path,
-    settings: Mapping[str, Any],
+    settings: Mapping[str, Any] | None,
     what: str,
     parse: Callable[[Any], Row],
     remedy: str = "choose another folder",
@@ -75,7 +75,7 @@ def continue_journal(
 
     Args:
         path: of the journal.
-        settings: JSON values that its first line must have.
+        settings: JSON values that its first line must have; None: it has rows of any work.
         what, parse: see `read_rows`.
         remedy: what to do if the settings are others.
 
@@ -83,12 +83,14 @@ def continue_journal(
         InputError: the file is no journal, has other settings, or is damaged.
         WriteError: the file cannot be written.
     """
+    head = [] if settings is None else [settings]
     if not path.exists():
-        write_rows(path, [settings])
+        write_rows(path, head)
         return []
-    recorded = read_rows(path, what, dict, slice(0, 1)) or [{}]
-    check_settings(path, recorded[0], settings, remedy)
-    rows = read_rows(path, what, parse, slice(1, None))
+    if settings is not None:
+        recorded = read_rows(path, what, dict, slice(0, 1)) or [{}]
+        check_settings(path, recorded[0], settings, remedy)
+    rows = read_rows(path, what, parse, slice(len(head), None))
     os.truncate(path, path.read_bytes().rfind(b"\n") + 1)  # after an interruption
     return rows
 

@@ -217,7 +217,7 @@ class Library:
         at = [x.ctypes.data + min(row, len(x) - 1) * x.itemsize for x in (*inputs, output)]
         pointers = [ctypes.c_void_p(address) for address in at]
         begin = time.thread_time_ns()
-        self.functions.controller_step(self.memory, ctypes.c_int64(row), *pointers)
+        self.functions.controller_step_at(self.memory, ctypes.c_int64(row), *pointers)
         return 1e-6 * (time.thread_time_ns() - begin)
 
 

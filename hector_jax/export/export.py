@@ -23,8 +23,8 @@ from hector_jax.control.weights_file import WEIGHTS, weights_tree
 from hector_jax.core.console import Broken, say
 from hector_jax.core.environment import versions
 from hector_jax.core.files import as_json, make_folder, write_file, write_json
-from hector_jax.core.inputs import InputError, plural, unknown
-from hector_jax.core.settings import Range, from_table, read_json, to_table
+from hector_jax.core.inputs import plural
+from hector_jax.core.settings import Range, to_table
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.export.check import (
     Check,
@@ -39,7 +39,6 @@ from hector_jax.export.source import controller_source, with_prefix
 from hector_jax.robot.model import Robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import ideal
-from hector_jax.store.folder import CONFIG
 
 SCHEMA = "weights.schema.json"
 TOLERANCE = 1e-6
@@ -57,40 +56,6 @@ _DESCRIPTIONS = {
 }
 _STATES = ("roll, pitch, yaw", "x, y, z", "their rates: wx, wy, wz", "vx, vy, vz")
 _INPUTS = ("force, foot 0 (left)", "force, foot 1 (right)", "moment, foot 0", "moment, foot 1")
-
-
-def find_weights(run: Path, name: str) -> Path:
-    """Find the file of a weight set.
-
-    Args:
-        run: folder of a run, or a weights file.
-        name: name of the set in the folder.
-
-    Raises:
-        InputError: one line with what is missing, and the available sets.
-    """
-    if not run.is_dir():
-        return run
-    sets = sorted(path.stem for path in (run / "weights").glob("*.json"))
-    if name not in sets:
-        raise InputError(f"{run}: {unknown('weight set', name, sets)}")
-    return run / "weights" / f"{name}.json"
-
-
-def controller_of_run(run: Path) -> WalkConfig:
-    """Return the controller that a run has tuned.
-
-    Raises:
-        InputError: its settings are damaged or of another version.
-    """
-    path = run / CONFIG
-    config = read_json(path, "the settings of a run")
-    try:
-        table = config["tune"]["rollout"]["walk"]
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{path}: not the settings of a walking controller: {error!r}") from error
-    # a setting that this version does not know is refused: the file goes to a robot
-    return from_table(f"{path}: tune.rollout.walk", WalkConfig, table)
 
 
 def _require_same(result: Check) -> None:

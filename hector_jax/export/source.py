@@ -97,7 +97,7 @@ def controller_source(
     mpc, footsteps = config.mpc, FootstepConfig()
     ours = footsteps.travel, footsteps.ahead
     if config.twin != TwinConfig() or (config.footstep.travel, config.footstep.ahead) != ours:
-        raise InputError("a twin is not exported, but a file of numbers is: --template")
+        raise InputError("a twin is not exported, but a file of numbers is: --into")
     parts = (*mpc.on("inputs"), *mpc.on("states"))
     own = [part for part in parts if part not in Constraint.known] + list(mpc.costs)
     if own:
@@ -141,7 +141,7 @@ def controller_source(
 
 FILES = ("controller.h", "controller.c", "CMakeLists.txt")
 _NAMES = "size exported lower upper init reset set_tunables set_max_changes drive from_imu".split()
-_NAMES += ["plan", "hold", "step"]
+_NAMES += ["plan", "hold", "step", "step_at"]
 
 
 def with_prefix(source: dict[str, str], prefix: str) -> dict[str, str]:

@@ -17,6 +17,7 @@ from hector_jax.control.reference import Command
 from hector_jax.core.geometry import euler_rates, rotation_from_euler
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import SOLVED, State, Trajectory
+from hector_jax.own.timing import STAMPS, Stamps, read_stamps, timing_faults
 from hector_jax.own.walk_file import check_legs, read_entries, read_walk, reference_of
 from hector_jax.robot.model import Robot
 from hector_jax.sim.diagnosis import FALLING, MOST_AT_LIMIT, STEADY, lasting, motors, steady_height
@@ -41,9 +42,12 @@ class CheckedLog(NamedTuple):
     walk: Trajectory  # with the reference of the command
     own: State | None  # reference in the log
     torque: Float[np.ndarray, "n joints"] | None  # as a share of the limits
+    stamps: Stamps  # of the samples, and of all plans
+    commanded: bool  # the log has the commanded forces
     has_effect: bool
-    stance: Bool[np.ndarray, "n feet"]  # planned contact if it can be trusted, else commanded load
-    # share of samples and feet whose planned contact is not that of the load; None without contact
+    # planned contact if it can be trusted, else the commanded load, else that of the ground
+    stance: Bool[np.ndarray, "n feet"] | None
+    # share of samples and feet whose planned contact is not that of the load; None without either
     astray: float | None
     units: dict[str, str]  # of `command` and `effect` where it is not N, in which `walk` has them
 
@@ -59,19 +63,21 @@ def read_check(
     """Read a log for `check_log`; return also how the walk ended, as `read_walk` does.
 
     Args:
-        path: file of the log, which may have `torque` (T, joints) [N m] too.
+        path: file of the log, which may have `torque` (T, joints) [N m] and stamps (`timing`) too,
+            and may lack the commanded forces.
         robot, command: that walked, and what was asked of it.
         seconds: expected length.
         tick: that of the gait [s].
 
     Raises:
         InputError: see `read_walk`; or less than SHORTEST is left of the walk, its joints never
-            move, or `torque` is not numbers of that shape.
+            move, or `torque` or stamps are not numbers of that shape.
     """
-    whole, end = read_walk(path, robot, seconds, tick)
+    whole, end = read_walk(path, robot, seconds, tick, commanded=False)
     check_legs(whole)
-    names = "joints", "torque", "contact", "effect.force", "reference.position"
-    rest = read_entries(path, names)
+    names = "joints", "torque", "contact", "command.force", "effect.force", "reference.position"
+    rest = read_entries(path, (*names, *STAMPS))
+    stamps = read_stamps(path, rest, len(rest["joints"]))
     torque, shape = rest.get("torque"), rest["joints"].shape
     if torque is not None and (torque.shape != shape or torque.dtype.kind not in "iuf"):
         text = f"torque must be numbers of shape {shape}"
@@ -96,11 +102,15 @@ def read_check(
             if abs(carried * newtons - 1.0) < UNLIKE:
                 units[name] = unit
                 walk = walk._replace(**{name: wrench._replace(force=newtons * wrench.force)})
-    loaded = walk.command.force[..., 2] > LOADED * weight
-    astray = float(np.mean(walk.contact != loaded)) if "contact" in rest else None
-    stance = walk.contact if astray is not None and astray <= ASTRAY else loaded
-    has_effect = "effect.force" in rest
-    return CheckedLog(robot, walk, own, share, has_effect, stance, astray, units), end
+    commanded, has_effect = ("command.force" in rest), ("effect.force" in rest)
+    force = (walk.command if commanded else walk.effect).force[..., 2]
+    loaded = force > LOADED * weight if commanded or has_effect else None
+    contact = walk.contact if "contact" in rest else None
+    astray = None if contact is None or loaded is None else float(np.mean(contact != loaded))
+    stance = loaded if contact is None or (astray or 0.0) > ASTRAY else contact
+    stamps = stamps._replace(time=None if stamps.time is None else stamps.time[rows])
+    log = CheckedLog(robot, walk, own, share, stamps, commanded, has_effect, stance, astray, units)
+    return log, end
 
 
 def check_log(log: CheckedLog, tick: float) -> list[str]:
@@ -116,6 +126,7 @@ def check_log(log: CheckedLog, tick: float) -> list[str]:
             "the ground on the robot, not those of the robot on the ground"
         ]
     questions = (
+        _timing,
         _units,
         _contacts,
         _velocities,
@@ -128,6 +139,19 @@ def check_log(log: CheckedLog, tick: float) -> list[str]:
         _plans,
     )
     return [line for ask in questions for line in ask(log, tick)]
+
+
+def unasked(log: CheckedLog) -> str:
+    """Return what of a log without commanded forces is not judged; empty if it has them."""
+    if log.commanded:
+        return ""
+    legs = "" if log.stance is not None else ", nor, as contact is absent too, joints and feet"
+    return f"without command.force gain and delay of the ground and plans are not judged{legs}"
+
+
+def _timing(log: CheckedLog, tick: float) -> Iterator[str]:
+    """Did clock and plans run as they should?"""
+    yield from timing_faults(log.stamps, log.walk, tick)
 
 
 def _middle(x: Float[np.ndarray, "n ..."], period: float) -> Float[np.ndarray, "m ..."]:
@@ -147,8 +171,8 @@ def _contacts(log: CheckedLog, tick: float) -> Iterator[str]:
     """Are forces commanded where feet are planned to stand?"""
     if log.astray is not None and log.astray > ASTRAY:
         yield (
-            f"contact is not that of the feet with a commanded load in {100 * log.astray:.0f} % of "
-            "the samples: its order of feet, or its meaning"
+            f"contact is not that of the feet with a {'commanded ' * log.commanded}load in "
+            f"{100 * log.astray:.0f} % of the samples: its order of feet, or its meaning"
         )
 
 
@@ -190,13 +214,14 @@ def _velocities(log: CheckedLog, tick: float) -> Iterator[str]:
 
 def _legs(log: CheckedLog, tick: float) -> Iterator[str]:
     """Do feet that stand stay where the joints say that they are?"""
-    yield from legs_found(log.robot, log.walk, log.stance)
+    if log.stance is not None:
+        yield from legs_found(log.robot, log.walk, log.stance)
 
 
 def _loads(log: CheckedLog, tick: float) -> Iterator[str]:
     """Is the mass that of the file, and does the robot stand at its height?"""
     force = (log.walk.effect if log.has_effect else log.walk.command).force[..., 2].sum(axis=1)
-    share = float(np.mean(force)) / log.weight
+    share = float(np.mean(force)) / log.weight if log.has_effect or log.commanded else 1.0
     if abs(share - 1.0) > (MASS if log.has_effect else COMMANDED_MASS):
         bears = "the ground bears" if log.has_effect else "commanded are"
         yield (
@@ -204,7 +229,7 @@ def _loads(log: CheckedLog, tick: float) -> Iterator[str]:
             f"{log.weight:.0f} N: its mass is {100 * abs(share - 1):.0f} % "
             f"{'more' if share > 1 else 'less'} than that of the file"
         )
-    yield from steady_height(log.walk, np.ones(len(log.stance), bool))
+    yield from steady_height(log.walk, np.ones(len(force), bool))
 
 
 def _ground(log: CheckedLog, tick: float) -> Iterator[str]:
@@ -230,7 +255,7 @@ def _ground(log: CheckedLog, tick: float) -> Iterator[str]:
 
 def _air(log: CheckedLog, tick: float) -> Iterator[str]:
     """Are feet in the air free of commanded forces?"""
-    if log.astray is None or log.astray > ASTRAY:
+    if log.stance is None or log.astray is None or log.astray > ASTRAY:
         return
     force = np.linalg.norm(log.walk.command.force, axis=-1)[~log.stance]
     if len(force) and force.mean() > IN_AIR * log.weight:
@@ -262,7 +287,8 @@ def _reference(log: CheckedLog, tick: float) -> Iterator[str]:
 
 def _plans(log: CheckedLog, tick: float) -> Iterator[str]:
     """How often does it plan, and are plans solved?"""
-    force, period = log.walk.command.force.reshape(len(log.stance), -1), float(log.walk.period)
+    period, count = float(log.walk.period), len(log.walk.joints)
+    force = log.walk.command.force.reshape(count, -1)
     changes = np.flatnonzero(np.any(np.diff(force, axis=0) != 0.0, axis=1))
     interval = period * float(np.median(np.diff(changes))) if len(changes) > 2 else 0.0
     if interval > 1.5 * tick:

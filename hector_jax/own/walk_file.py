@@ -28,7 +28,9 @@ FLAGS = ("contact", "fallen", "legs_touch")
 """Entries of zeros and ones."""
 
 
-def read_walk(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Trajectory, str]:
+def read_walk(
+    path: Path, robot: Robot, seconds: float, tick: float, *, commanded: bool = True
+) -> tuple[Trajectory, str]:
     """Read a walk. One that ends early, or whose state is no number from some time on, fell then.
 
     Args:
@@ -36,6 +38,7 @@ def read_walk(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Tr
         robot: the robot that walked.
         seconds: expected length.
         tick: that of the gait [s], a whole number of periods.
+        commanded: refuse a file without `command`, which is zero else.
 
     Returns:
         The walk (numpy), with the reference of the file, if any; from its end on, samples repeat
@@ -45,7 +48,8 @@ def read_walk(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Tr
         InputError: one line naming the file and the entry that is missing, of another shape, or not
             of finite numbers; or its period is no part of a tick.
     """
-    walk, valid, wanted = _entries(path, robot, seconds, tick)
+    needed = _NEEDED if commanded else tuple(name for name in _NEEDED if name != "command.")
+    walk, valid, wanted = _entries(path, robot, seconds, tick, needed)
     min_height, max_tilt = robot.description.limits
     tilt = np.abs(walk.state.euler[:valid, :2]).max(axis=1)
     tilt = np.where(walk.state.position[:valid, 2] >= min_height, tilt, 0.0)  # of an upright trunk
@@ -102,7 +106,9 @@ def check_legs(walk: Trajectory) -> None:
         raise InputError(f"its joints never move: {text}")
 
 
-def _entries(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Trajectory, int, int]:
+def _entries(
+    path: Path, robot: Robot, seconds: float, tick: float, needed: tuple[str, ...]
+) -> tuple[Trajectory, int, int]:
     """Return the entries of a file; see `read_walk`.
 
     Returns:
@@ -122,7 +128,8 @@ def _entries(path: Path, robot: Robot, seconds: float, tick: float) -> tuple[Tra
     if not 1 <= count <= wanted:
         expected = f"{wanted} samples of joints in {seconds:g} s of {period:g} s"
         raise InputError(f"{path}: expected {expected}, got {count}{asked}")
-    walk = _checked(path, arrays, empty, count)
+    needed = _NEEDED if any(name.startswith("command.") for name in arrays) else needed
+    walk = _checked(path, arrays, empty, count, needed)
     finite = np.all([np.isfinite(x).all(axis=1) for x in walk.state], axis=0)
     valid = count if finite.all() else int(np.argmin(finite))
     for name, x in named_leaves(walk).items():
@@ -137,14 +144,16 @@ def _divides(period: np.ndarray, tick: float) -> bool:
     return abs(tick / float(period) - round(tick / float(period))) < 1e-3
 
 
-def _checked(path: Path, arrays: dict[str, Any], empty: Trajectory, count: int) -> Trajectory:
+def _checked(
+    path: Path, arrays: dict[str, Any], empty: Trajectory, count: int, needed: tuple[str, ...]
+) -> Trajectory:
     """Return the walk of the entries of a file, of which those that may be absent are filled in."""
     found = {}
     for name, like in named_leaves(empty).items():
         shape = tuple(x or count for x in np.shape(like))  # the empty walk has no samples
         default = found.get(name.replace("effect", "command"), np.zeros(shape))
-        if name not in arrays and name.startswith(_NEEDED):
-            names = ", ".join(n for n in named_leaves(empty) if n.startswith(_NEEDED))
+        if name not in arrays and name.startswith(needed):
+            names = ", ".join(n for n in named_leaves(empty) if n.startswith(needed))
             raise InputError(f"{path}: {name} is missing; expected {names}")
         found[name] = arrays.get(name, default)
         if (got := found[name].shape) != shape:

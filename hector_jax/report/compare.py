@@ -13,7 +13,7 @@ from rich.text import Text
 
 from hector_jax.core.inputs import InputError
 from hector_jax.report.report import VOID, plain_console
-from hector_jax.store.folder import RESULT, Histories, Run
+from hector_jax.store.run import RESULT, Histories, Run
 from hector_jax.verdict.metrics import BASELINES, Interval
 
 
@@ -32,7 +32,7 @@ def compare_runs(runs: Sequence[Run]) -> dict[str, Any]:
         raise InputError("expected at least one run folder, got none")
     rows = [
         {
-            "run": run.name,
+            "run": str(run.folder),
             "seconds": float(run.made_with["seconds"]) if "seconds" in run.made_with else None,
             "sets": {name: _verdict(run, name) for name in run.result["sets"]},
             "tuning": _iterations(run.histories),
@@ -55,7 +55,7 @@ def _verdict(run: Run, name: str) -> dict[str, Any]:
         _cells(name, verdict)  # raises if the file lacks a printed value
         return verdict
     except (KeyError, TypeError, AttributeError, ValueError):
-        raise InputError(f"{Path(run.name) / RESULT}: set {name} has no verdict") from None
+        raise InputError(f"{run.folder / RESULT}: set {name} has no verdict") from None
 
 
 def _iterations(histories: Histories) -> dict[str, dict[str, int]]:

@@ -28,7 +28,7 @@ from hector_jax.grfm.training import predict
 from hector_jax.report.report import WORLDS, Picture, render
 from hector_jax.robot import srbm
 from hector_jax.robot.model import Robot
-from hector_jax.store.folder import RESULT
+from hector_jax.store.run import RESULT
 
 PHASES = {  # time [s] since the switch of stance
     "first 30 ms": (0.0, 0.03),

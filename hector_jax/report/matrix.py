@@ -1,6 +1,6 @@
 """The report of an evaluation in several engines and models: a page, its numbers and a picture."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,9 @@ from hector_jax.report import plots
 from hector_jax.report.report import Picture, change_text, markdown_table, render, seeds_text
 from hector_jax.sim.engine import ENGINES
 from hector_jax.verdict import matrix
-from hector_jax.verdict.matrix import OWN, Cells, Column
-from hector_jax.verdict.metrics import BASELINES, FEWEST, Interval, compare
+from hector_jax.verdict.matrix import OWN, Cells, Column, Columns
+from hector_jax.verdict.metrics import BASELINES, FEWEST, Interval, compare, fixed_rank
+from hector_jax.verdict.stopping import claims_of
 
 TITLES = {name: engine.title for name, engine in ENGINES.items()}
 LEARNED_FROM = ("c", "mjx")  # engines whose walks train the nets and tune weights
@@ -78,6 +79,7 @@ def claims(cells: Cells, differs: Mapping[str, str], world: str) -> dict[str, li
         ENGINES=TITLES,
         LEARNED_FROM=LEARNED_FROM,
         tuned=[name for name in names if name not in BASELINES],
+        fixed=all(verdict.rank is fixed_rank for verdict in cells.values()),
     )
     texts = {name: fill(f"{name}.txt.j2") for name in ("claims", "limits")}
     return {name: [x for x in text.splitlines() if x] for name, text in texts.items()}
@@ -127,6 +129,31 @@ def matrix_report(cells: Cells, differs: Mapping[str, str], world: str) -> dict[
     """
     told = claims(cells, differs, world)
     return matrix.matrix_result(cells, world) | {"differs": dict(differs), **told}
+
+
+def stopping_result(
+    columns: Columns, planned: Mapping[Column, Sequence[int]]
+) -> list[dict[str, Any]]:
+    """Return where each column stopped and why, as JSON values: `stopping` of verdict.json.
+
+    Args:
+        columns: the walks.
+        planned: seeds of the plants that would have walked in each column.
+    """
+    result = []
+    for column, verdict in columns.items():
+        plants, most = len(verdict.seeds), len(planned[column])
+        per_plant = len(verdict.scores) * len(verdict.scenes)
+        numbers = {"plants": plants, "most_plants": most}
+        numbers |= {"walks": per_plant * plants, "walks_saved": per_plant * (most - plants)}
+        result.append({**column._asdict(), **numbers, "claims": claims_of(verdict)})
+    return result
+
+
+def stopping_lines(stops: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Say where each column stopped and why, a line each."""
+    titles = [title_of(Column(stop["engine"], stop["model"])) for stop in stops]
+    return render("stopping.txt.j2", stops=stops, titles=titles).splitlines()
 
 
 def write_matrix_report(

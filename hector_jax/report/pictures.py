@@ -17,7 +17,7 @@ from hector_jax.report.report import WORLDS, Picture
 from hector_jax.report.video import VideoUnavailable, write_film, write_strip
 from hector_jax.report.view import ViewedWalk
 from hector_jax.robot.model import Robot
-from hector_jax.store.folder import Histories
+from hector_jax.store.run import Histories
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.loss import Loss
 

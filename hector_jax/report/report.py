@@ -166,13 +166,20 @@ def plain_console(console: Console | None, width: int) -> Console:
     return Console(file=console.file, highlight=False, width=width, color_system=None)
 
 
-def print_tables(verdict: Verdict, world: str = "standin", console: Console | None = None) -> None:
+def print_tables(
+    verdict: Verdict,
+    world: str = "standin",
+    console: Console | None = None,
+    *,
+    more: Sequence[str] = (),
+) -> None:
     """Print the verdict as a table, and of several scenes each, without colours outside a terminal.
 
     Args:
         verdict: verdict to print.
         world: world of the walks.
         console: output; None means stdout.
+        more: lines below the tables.
     """
     console = plain_console(console, width=160)
     where = f"{plural(len(verdict.seeds), 'plant')} on the {WORLDS.get(world, world)}"
@@ -182,6 +189,8 @@ def print_tables(verdict: Verdict, world: str = "standin", console: Console | No
         for line in legend(one):
             console.print(Text(line, style="dim"))
     console.print(Text(ERRORS, style="dim"))
+    for line in more:
+        console.print(Text(line))
 
 
 def _terminal_table(verdict: Verdict, padding: int) -> Table:

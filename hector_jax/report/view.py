@@ -29,7 +29,7 @@ from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.report.motion import INK, Motion
 from hector_jax.report.plots.style import rgb_of
 from hector_jax.report.report import render
-from hector_jax.store.folder import METRICS, RESULT, loss_curves, progress_sentence, read_histories
+from hector_jax.store.run import METRICS, Run, loss_curves, progress_sentence
 
 _RATE = 30.0  # displayed ticks per second, at most
 _PAUSE = 1.0  # [s] between readings of the metrics
@@ -322,12 +322,13 @@ class Page:
             handles["name"].text = f"{name}, fell at {motion.fall_time:.2f} s" if fell else name
 
     def _read_metrics(self) -> None:
-        path, done = self._folder / METRICS, (self._folder / RESULT).exists()
+        run = Run(self._folder)
+        path, done = self._folder / METRICS, run.is_finished
         state = (path.stat().st_size if path.exists() else 0, done)
         if state == self._metrics_state:
             return
         self._metrics_state = state
-        histories = read_histories(self._folder)
+        histories = run.histories
         lines = loss_curves(histories) or _NO_CURVES
         iterations = np.arange(float(len(next(iter(lines.values())))))
         with self._server.atomic():

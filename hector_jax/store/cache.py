@@ -1,10 +1,10 @@
 """Artefacts on disk: results that take more than a moment to compute are computed once.
 
-An artefact is a tree of arrays in one file: a tuning, the score of a walk, the scores of a group of
-walks. The name of its file ends in a `content_key` of all its inputs: settings, robot, command,
-net, weights, plant, seed, loss, and the code and packages that compute it. Other inputs make
-another file, so that no artefact is mistaken for another or overwritten. A process that is killed
-loses the artefacts that were not finished; a damaged file is named in a message and made again.
+An artefact is a tree of arrays in one file: a tuning, a walk. The name of its file ends in a
+`content_key` of all its inputs: settings, robot, command, net, weights, plant, seed, loss, and the
+code and packages that compute it. Other inputs make another file, so that no artefact is mistaken
+for another or overwritten. A process that is killed loses the artefacts that were not finished; a
+damaged file is named in a message and made again.
 """
 
 import hashlib
@@ -55,6 +55,24 @@ def content_key(*parts: Any, code: Sequence[str]) -> str:
     return hashlib.sha256(key.encode()).hexdigest()[:12]
 
 
+def load_stored(
+    paths: Mapping[Key, Path], like: Callable[[Key], Any], *, kind: str, robot: Robot
+) -> dict[Key, Any]:
+    """Return the artefacts that are on disk; a damaged one is named and left out.
+
+    Args:
+        paths, like, kind, robot: see `load_or_make`.
+    """
+    trees = {}
+    for key, path in paths.items():
+        try:
+            if path.exists():
+                trees[key], _ = load_tree(path, like(key), kind=kind, robot=robot)
+        except InputError as error:
+            say(f"made anew: {error}")
+    return trees
+
+
 def load_or_make(
     paths: Mapping[Key, Path],
     make: Callable[[list[Key], Mapping[Key, Tree]], Iterable[tuple[Key, Tree]]],
@@ -81,13 +99,7 @@ def load_or_make(
     if not paths:
         return {}
     with locked(next(iter(paths.values())).parent):
-        trees = {}
-        for key, path in paths.items():
-            try:
-                if path.exists():
-                    trees[key], _ = load_tree(path, like(key), kind=kind, robot=robot)
-            except InputError as error:
-                say(f"made anew: {error}")
+        trees = load_stored(paths, like, kind=kind, robot=robot)
         missing = [key for key in paths if key not in trees]
         for key, tree in make(missing, dict(trees)) if missing else ():
             save_tree(paths[key], tree, kind=kind, robot=robot, about=about)

@@ -33,7 +33,7 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
 from hector_jax.store.cache import content_key, load_or_make
-from hector_jax.store.folder import as_row
+from hector_jax.store.run import as_row
 from hector_jax.store.setup import Setup
 from hector_jax.tuning import batch, difftune
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning, step_status

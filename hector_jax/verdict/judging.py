@@ -1,20 +1,29 @@
-"""The step `judge`: walks of weight sets on plants, each score an artefact (cache.py)."""
+"""The step `judge`: walks of weight sets on plants, and the table of their scores.
+
+In a folder the table is `walks.jsonl`, a row for each walk, written as it ends. The column `key` is
+a `content_key` of all that determines the walk: what is there is not walked again, and another
+robot, engine or code adds rows of its own.
+"""
 
 import re
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
 from hector_jax.control.reference import Command, standing_anchor
 from hector_jax.control.weights import Weights
 from hector_jax.core.console import bar, say
+from hector_jax.core.files import locked
 from hector_jax.core.inputs import plural
-from hector_jax.core.trajectory import SOLVED, State, Trajectory, no_samples
+from hector_jax.core.journal import add_row, continue_journal
+from hector_jax.core.trajectory import SOLVED, Trajectory, no_samples
+from hector_jax.core.tree_file import save_tree
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import Robot
@@ -23,11 +32,14 @@ from hector_jax.sim.engine import MUJOCO_C, Engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import Imperfections
-from hector_jax.store.cache import content_key, load_or_make
+from hector_jax.store.cache import content_key, load_stored
 from hector_jax.store.setup import Setup
+from hector_jax.tuning.loss import Loss
 from hector_jax.tuning.rollout import Scenario, rollout, rollout_config
 from hector_jax.verdict import metrics
+from hector_jax.verdict.stopping import StoppingRule, is_clear
 
+TABLE = "walks.jsonl"
 # modules that determine the numbers, for `content_key`
 _CODE = ("verdict.judging", "sim.diagnosis", "verdict.metrics")
 
@@ -36,11 +48,10 @@ Case = tuple[str, str, int]
 
 
 class ScoredWalk(NamedTuple):
-    """Stored results of one walk."""
+    """Results of one walk."""
 
     score: metrics.Score
-    upright: Float[np.ndarray, ""]  # [s] until a fall or the end; below zero in the start-up
-    last: State  # last upright state
+    upright: float  # [s] until a fall or the end; below zero in the start-up
     startup: str  # description of a fall in the start-up; empty if there is none
 
 
@@ -86,25 +97,22 @@ def _score_walk(setup: Setup, job: Job, walk: Trajectory, engine: Engine) -> Sco
         body, host_job = jax.tree.map(np.asarray, robot), on_host(job)
         if fall := pool.submit(fall_of, config.rollout.walk, body, host_job).result():
             upright, text = fall.time, str(fall)
-    last = jax.tree.map(lambda x: np.asarray(x)[max(samples - 1, 0)], walk.state)
-    score = metrics.score(config.loss, walk)
-    return ScoredWalk(score, np.asarray(upright), last, text)
+    return ScoredWalk(metrics.score(config.loss, walk), upright, text)
 
 
-def _like(setup: Setup, with_walk: bool) -> Any:
-    """Return the structure of the artefact of one walk, with or without its trajectory."""
-    walk = no_samples(len(setup.robot.joint_lower), len(setup.robot.foot_point))
-    score = metrics.score_like(loss=setup.config.loss)
-    return ScoredWalk(score, np.zeros(()), walk.initial, ""), walk if with_walk else None
+def _as_row(walked: ScoredWalk) -> dict[str, Any]:
+    """Return the columns of the table that a walk decides; angles in rad, lengths in m."""
+    score = jax.tree.map(lambda x: x.tolist(), walked.score)._asdict()
+    return score.pop("losses") | score | {"upright": walked.upright, "startup": walked.startup}
 
 
-def _file_name(setup: Setup, case: Case, job: Job, with_walk: bool, engine: Engine) -> str:
-    _, config, robot = setup
-    parts = [engine.key, config.rollout.walk, repr(config.loss), robot, job]
-    key = content_key(*parts, *([job.plant] if job.plant else []), code=(*engine.modules, *_CODE))
-    # labels that become equal are told apart by the key
-    labels = (re.sub(r"[^\w.-]+", "_", str(label)) for label in case)
-    return "-".join(["walk" if with_walk else "score", *labels, f"{key}.npz"])
+def _from_row(loss: Loss, row: Mapping[str, Any]) -> ScoredWalk:
+    """Return the walk of a row; null, for a number that is not finite, is NaN."""
+    number = partial(np.array, dtype=float)  # NaN of None
+    columns = {name: number(row[name]) for name in metrics.Score._fields if name in row}
+    losses = {part: number(row[part]) for part in metrics.parts_of(loss)}
+    score = metrics.Score(losses, **columns | {"fallen": np.array(row["fallen"], bool)})
+    return ScoredWalk(score, float(number(row["upright"])), str(row["startup"]))
 
 
 def say_faults(walks: Mapping[str, Sequence[ScoredWalk]]) -> None:
@@ -124,68 +132,130 @@ def score_jobs(
     title: str,
     folder: Path | None = None,
     engine: Engine = MUJOCO_C,
-    with_walk: Container[Case] = (),
+    with_walk: Collection[Case] = (),
+    about: Mapping[str, str] | None = None,
 ) -> dict[Case, tuple[ScoredWalk, Trajectory | None]]:
-    """Walk jobs and score the walks; walks whose scores are in the folder are not repeated.
+    """Walk jobs and score the walks; walks that are in the table of the folder are not repeated.
 
     Args:
         setup: workers, controller and loss, nominal body.
-        jobs: jobs by case; its labels are parts of the names of files.
+        jobs: jobs by case, whose labels are columns of the table.
         title: title of the progress bar.
-        folder: folder of the scores; None: nothing is saved.
+        folder: folder of the table; None: nothing is saved.
         engine: engine of the walks.
-        with_walk: cases whose walks are saved beside their scores.
+        with_walk: cases whose walks are saved beside the table.
+        about: other columns of the table, the same for all walks, such as `world`.
 
     Raises:
-        InputError: the folder cannot be written, or the engine cannot walk a job.
+        InputError: the folder cannot be written, its table is damaged, or the engine cannot walk a
+            job.
     """
-    tick = setup.config.rollout.walk.gait.tick
-
-    def make(missing: list[Case], stored: Mapping[Case, Any]) -> Iterator[tuple[Case, Any]]:
-        remark = f"; {len(stored)} of {plural(len(jobs), 'walk')} are there" if stored else ""
+    keys = {case: _key(setup, job, engine) for case, job in jobs.items()}
+    files, found, stored = {}, {}, {}
+    with nullcontext() if folder is None else locked(folder):
+        if folder is not None:
+            found = _read_table(folder, setup.config.loss, keys)
+            files = {case: folder / _file_name(case, keys[case]) for case in with_walk}
+            like = no_samples(len(setup.robot.joint_lower), len(setup.robot.foot_point))
+            stored = load_stored(files, lambda _: like, kind="walk", robot=setup.robot)
+        missing = [x for x in jobs if x not in found or (x in files and x not in stored)]
+        there = len(jobs) - len(missing)
+        remark = f"; {there} of {plural(len(jobs), 'walk')} are there" if there else ""
         new_jobs = [jobs[case] for case in missing]
-        walks = walk_jobs(setup, new_jobs, title + remark, engine)
+        walks = walk_jobs(setup, new_jobs, title + remark, engine) if missing else ()
         for case, walk in zip(missing, walks, strict=True):
-            samples = at_interval(walk, tick) if case in with_walk else None
-            yield case, (_score_walk(setup, jobs[case], walk, engine), samples)
+            trajectory, name, seed = case
+            row = {"trajectory": trajectory, "set": name, "seed": seed, "engine": engine.name}
+            row |= dict(about or {}) | {"key": keys[case]}
+            row |= _as_row(_score_walk(setup, jobs[case], walk, engine))
+            if case in files:
+                stored[case] = at_interval(walk, setup.config.rollout.walk.gait.tick)
+                save_tree(files[case], stored[case], kind="walk", robot=setup.robot)
+            if folder is not None:
+                add_row(folder / TABLE, row)
+            found[case] = _from_row(setup.config.loss, row)  # as it is read again
+    return {case: (found[case], stored.get(case)) for case in jobs}
 
-    if folder is None:
-        return dict(make(list(jobs), {}))
-    paths = {
-        case: folder / _file_name(setup, case, job, case in with_walk, engine)
-        for case, job in jobs.items()
-    }
-    like = lambda case: _like(setup, case in with_walk)  # noqa: E731
-    return load_or_make(paths, make, like=like, kind="walk", robot=setup.robot)
+
+def _read_table(folder: Path, loss: Loss, keys: Mapping[Case, str]) -> dict[Case, ScoredWalk]:
+    """Return the walks that are in the table of a folder, which is begun if it is missing."""
+
+    def parse(row: Mapping[str, Any]) -> tuple[Case, ScoredWalk | None]:
+        case = row["trajectory"], row["set"], row["seed"]
+        return case, _from_row(loss, row) if keys.get(case) == row["key"] else None
+
+    rows = continue_journal(folder / TABLE, None, "the table of walks", parse)
+    return {case: walked for case, walked in rows if walked}
+
+
+def _key(setup: Setup, job: Job, engine: Engine) -> str:
+    """Return the key of all that determines the row of a walk."""
+    _, config, robot = setup
+    parts = [engine.key, config.rollout.walk, repr(config.loss), robot, job]
+    return content_key(*parts, *([job.plant] if job.plant else []), code=(*engine.modules, *_CODE))
+
+
+def _file_name(case: Case, key: str) -> str:
+    """Return the file of a walk; labels that become equal are told apart by their key."""
+    labels = (re.sub(r"[^\w.-]+", "_", str(label)) for label in case)
+    return "-".join(["walk", *labels, f"{key}.npz"])
 
 
 def judge_jobs(
-    setup: Setup, jobs: Mapping[Case, Job], *, where: str = "", **options: Any
+    setup: Setup,
+    jobs: Mapping[Case, Job],
+    *,
+    title: str,
+    where: str = "",
+    rule: StoppingRule | None = None,
+    **options: Any,
 ) -> Judged:
     """Walk every set on every trajectory and plant, score the walks and say their faults.
 
     Args:
-        setup, options: see `score_jobs`.
+        setup, title, options: see `score_jobs`.
         jobs: a job for each trajectory, set and seed.
         where: what follows the name of a set where its faults are said.
+        rule: says when the other plants, in the order of the jobs, need not walk; None: all walk.
     """
-    results = score_jobs(setup, jobs, **options)
-    walks = {case: walk for case, (walk, _) in results.items()}
-    scenes, names, seeds = (list(dict.fromkeys(labels)) for labels in zip(*jobs, strict=True))
-    groups = {
-        (scene, name): [walks[scene, name, seed] for seed in seeds]
-        for scene in scenes
-        for name in names
-    }
-    on = {scene: f" on {scene}{where}" if len(scenes) > 1 else where for scene in scenes}
-    say_faults({f"{name}{on[scene]}": walks for (scene, name), walks in groups.items()})
-    scores = {
-        scene: {name: [walk.score for walk in groups[scene, name]] for name in names}
-        for scene in scenes
-    }
-    verdict = metrics.make_verdict(setup.config.loss, seeds, scores)
-    stored = {case: walk for case, (_, walk) in results.items() if walk is not None}
+    seeds, walks, stored = _seeds_of(jobs), {}, {}
+    for batch in rule.batches(len(seeds)) if rule else [range(len(seeds))]:
+        plants = seeds[batch.start : batch.stop]
+        next_jobs = {case: job for case, job in jobs.items() if case[2] in plants}
+        remark = f", plants {batch.start + 1} to {batch.stop} of {len(seeds)}" if rule else ""
+        results = score_jobs(setup, next_jobs, title=title + remark, **options)
+        walks |= {case: walk for case, (walk, _) in results.items()}
+        stored |= {case: walk for case, (_, walk) in results.items() if walk is not None}
+        if rule and is_clear(_verdict_of(setup, walks, rule)):
+            break
+    verdict = _verdict_of(setup, walks, rule)
+    for scene, by_set in _by_set(walks).items():
+        on = f" on {scene}{where}" if len(verdict.scenes) > 1 else where
+        say_faults({f"{name}{on}": group for name, group in by_set.items()})
     return Judged(walks, verdict, stored)
+
+
+def _seeds_of(cases: Iterable[Case]) -> list[int]:
+    return list(dict.fromkeys(seed for *_, seed in cases))
+
+
+def _by_set(walks: Mapping[Case, ScoredWalk]) -> dict[str, dict[str, list[ScoredWalk]]]:
+    """Return the walks by trajectory and set, in the order of their plants."""
+    groups: dict[str, dict[str, list[ScoredWalk]]] = {}
+    for (trajectory, name, _), walk in walks.items():
+        groups.setdefault(trajectory, {}).setdefault(name, []).append(walk)
+    return groups
+
+
+def _verdict_of(
+    setup: Setup, walks: Mapping[Case, ScoredWalk], rule: StoppingRule | None
+) -> metrics.Verdict:
+    scores = {
+        scene: {name: [walk.score for walk in group] for name, group in by_set.items()}
+        for scene, by_set in _by_set(walks).items()
+    }
+    rank = rule.rank if rule else metrics.fixed_rank
+    return metrics.make_verdict(setup.config.loss, _seeds_of(walks), scores, rank)
 
 
 def judge(
@@ -199,6 +269,7 @@ def judge(
     seconds: float = 4.0,
     folder: Path | None = None,
     engine: Engine = MUJOCO_C,
+    about: Mapping[str, str] | None = None,
 ) -> Judged:
     """Walk every weight set on every trajectory and plant, and score the walks.
 
@@ -208,9 +279,10 @@ def judge(
         commands, seconds: command of each trajectory, and length of the walks.
         plants, seeds: plants, and the seeds of their estimators.
         title: title of the progress bar.
-        folder: folder of the scores, and of the walks on the first plant; walks whose scores are
-            in it are not repeated; None: nothing is saved.
+        folder: folder of the table, and of the walks on the first plant; walks that are in it are
+            not repeated; None: nothing is saved.
         engine: engine of the walks.
+        about: other columns of the table, the same for all walks, such as `world`.
 
     Raises:
         InputError: the folder cannot be written, or the engine cannot walk a plant.
@@ -222,5 +294,5 @@ def judge(
         for name, weights in sets.items()
     }
     first = [case for case in jobs if case[2] == seeds[0]] if folder else []
-    options = {"title": title, "folder": folder, "engine": engine, "with_walk": first}
-    return judge_jobs(setup, jobs, **options)
+    options = {"title": title, "folder": folder, "engine": engine, "about": about}
+    return judge_jobs(setup, jobs, with_walk=first, **options)

@@ -7,7 +7,8 @@ means are given beside it.
 
 Plants are the sample: walks of one plant are not independent. The interval of a median is that of
 two order statistics, which covers it for any distribution; that of a mean is Student's. Below six
-plants there is none: the whole range of five holds the median in 94 % of cases only.
+plants there is none: the whole range of five holds the median in 94 % of cases only. Where walks
+decide how many plants walk, the order statistics are those of `verdict.stopping`.
 
 A fall stays in the numbers with the charge of the loss. A comparison counts only if neither set
 falls more often than the other by 2 of 32 walks or the same share.
@@ -22,7 +23,7 @@ from jaxtyping import Bool, Float, Int
 
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree import stack
-from hector_jax.tuning.loss import PAPER_LOSS, Loss, alphas, losses, switch_loss, total
+from hector_jax.tuning.loss import Loss, alphas, losses, switch_loss, total
 
 BASELINES = ("nominal", "expert", "start")
 
@@ -75,6 +76,21 @@ class Comparison(NamedTuple):
     counts: bool  # neither set falls so much more often that losses are not comparable
 
 
+Rank = Callable[[int], int]
+"""Number of values, of so many plants, up to each end of an interval; zero if there is none."""
+
+
+def fixed_rank(plants: int) -> int:
+    """Return the `Rank` of an interval of a median if the number of plants is chosen beforehand.
+
+    >>> fixed_rank(5), fixed_rank(6), fixed_rank(16)
+    (0, 1, 4)
+    """
+    from scipy.special import bdtr  # slow to import
+
+    return int(np.searchsorted(bdtr(np.arange(plants), plants, 0.5), (1 - COVERAGE) / 2))
+
+
 class Verdict(NamedTuple):
     """Scores of all sets on the same plants of one world, in the same scenes."""
 
@@ -82,6 +98,7 @@ class Verdict(NamedTuple):
     scenes: tuple[str, ...]  # names of the trajectories
     scores: dict[str, Score]  # by set, (plants, scenes) each
     loss: Loss
+    rank: Rank = fixed_rank  # of the intervals of medians
 
     def of_scene(self, *scenes: str) -> "Verdict":
         """Return the walks of one scene, or of some."""
@@ -106,7 +123,7 @@ class Verdict(NamedTuple):
     @property
     def parts(self) -> tuple[str, ...]:
         """Names of the terms of the loss, and of their sum."""
-        return (*(term.name for term in self.loss), "L")
+        return parts_of(self.loss)
 
 
 class Summary(NamedTuple):
@@ -115,6 +132,11 @@ class Summary(NamedTuple):
     means: dict[str, Interval]  # over plants and scenes, by part
     falls: int  # walks in which it falls
     against: dict[str, Comparison]  # by the other set
+
+
+def parts_of(loss: Loss) -> tuple[str, ...]:
+    """Return the names of the terms of a loss, and of their sum."""
+    return (*(term.name for term in loss), "L")
 
 
 def score(loss: Loss, walk: Trajectory) -> Score:
@@ -140,20 +162,16 @@ def score(loss: Loss, walk: Trajectory) -> Score:
     )
 
 
-def score_like(*axes: int, loss: Loss = PAPER_LOSS) -> Score:
-    """Return a score of zeros with given leading axes, for `load_tree`."""
-    zero, vector = np.zeros(axes), np.zeros((*axes, 3))
-    parts = dict.fromkeys((*(term.name for term in loss), "L"), zero)
-    return Score(parts, zero, vector, vector, zero.astype(bool), zero, zero)
-
-
 def _rms(error: Float[np.ndarray, "*n 3"], rows: Bool[np.ndarray, "*n"]) -> Float[np.ndarray, "3"]:
     """Return the root mean square over some rows; NaN without rows."""
     return np.sqrt(np.mean(error[rows] ** 2, axis=0)) if rows.any() else np.full(3, np.nan)
 
 
 def make_verdict(
-    loss: Loss, seeds: Sequence[int], scores: Mapping[str, Mapping[str, Sequence[Score]]]
+    loss: Loss,
+    seeds: Sequence[int],
+    scores: Mapping[str, Mapping[str, Sequence[Score]]],
+    rank: Rank = fixed_rank,
 ) -> Verdict:
     """Combine the walks of all sets into a verdict.
 
@@ -161,6 +179,7 @@ def make_verdict(
         loss: loss of the scores.
         seeds: seeds of the plants, in the order of the scores.
         scores: scores by scene and set, one per seed; all scenes have the same sets.
+        rank: of the intervals of medians.
 
     Raises:
         ValueError: there are no seeds, or a set has another number of walks or a loss that is not
@@ -175,23 +194,20 @@ def make_verdict(
         stacked[name] = stack([stack(walks) for _, *walks in by_plant])
         if wrong := np.asarray(seeds)[~np.isfinite(stacked[name].L).all(axis=1)].tolist():
             raise ValueError(f"set '{name}': the loss on seeds {wrong} is not a finite number")
-    return Verdict(np.asarray(seeds, int), tuple(scores), stacked, loss)
+    return Verdict(np.asarray(seeds, int), tuple(scores), stacked, loss, rank)
 
 
-def interval_of_median(values: Float[np.ndarray, " plants"]) -> Interval:
+def interval_of_median(values: Float[np.ndarray, " plants"], rank: Rank = fixed_rank) -> Interval:
     """Return the median with the narrowest symmetric pair of values that covers it in 95 %.
 
     >>> interval_of_median(np.array([1.0, 2.0, 3.0, 4.0, 5.0, 60.0]))
     Interval(value=3.5, low=1.0, high=60.0)
     """
-    from scipy.special import bdtr  # slow to import
-
-    count, value = len(values), float(np.median(values))
-    below = int(np.searchsorted(bdtr(np.arange(count), count, 0.5), (1 - COVERAGE) / 2))
-    if count < FEWEST:
+    value, at = float(np.median(values)), rank(len(values))
+    if not at:
         return Interval(value, np.nan, np.nan)
     ordered = np.sort(values)
-    return Interval(value, float(ordered[below - 1]), float(ordered[count - below]))
+    return Interval(value, float(ordered[at - 1]), float(ordered[-at]))
 
 
 def interval_of_mean(values: Float[np.ndarray, " plants"]) -> Interval:
@@ -223,7 +239,7 @@ def compare(verdict: Verdict, name: str, baseline: str) -> Comparison:
     for part in verdict.parts:
         # a walk that falls at once has no L_ctrl: keep its ratio finite
         ratio = (score.losses[part] + _TINY) / (base.losses[part] + _TINY)
-        median = interval_of_median(np.median(ratio, axis=1))
+        median = interval_of_median(np.median(ratio, axis=1), verdict.rank)
         change[part] = Interval(*(100.0 * (r - 1.0) for r in median))
     wins = float(np.mean(score.L < base.L))
     return Comparison(change, wins, falls_comparable(score.fallen, base.fallen))

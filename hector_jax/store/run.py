@@ -6,7 +6,8 @@ of code and packages, `metrics.jsonl` a line for each iteration, `weights/` the 
 """
 
 from collections.abc import Mapping, Sequence
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from hector_jax.control.controller import WalkConfig
 from hector_jax.control.weights import (
     Weights,
     expert,
@@ -26,10 +28,11 @@ from hector_jax.control.weights import (
     weights_to_vector,
 )
 from hector_jax.control.weights_file import load_weights
-from hector_jax.core.inputs import InputError, short_repr
+from hector_jax.core.inputs import InputError, short_repr, unknown
 from hector_jax.core.journal import read_rows
-from hector_jax.core.settings import convert, read_json
-from hector_jax.robot.model import Robot
+from hector_jax.core.settings import convert, from_table, read_json
+from hector_jax.robot.model import Robot, load_robot
+from hector_jax.store.cache import robot_hash
 from hector_jax.tuning.difftune import Iteration
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import Loss, named_loss
@@ -39,16 +42,6 @@ CONFIG, METRICS, RESULT, VERSIONS = "config.json", "metrics.jsonl", "result.json
 _MAX_BYTES = 100_000_000
 
 Histories = Mapping[str, Sequence[Iteration]]  # by set
-
-
-class Run(NamedTuple):
-    """A finished run."""
-
-    name: str  # the folder as the user named it
-    result: Mapping[str, Any]  # result.json
-    histories: Histories  # metrics.jsonl
-    settings: dict[str, Any]  # config.json, nested names joined by dots
-    made_with: Mapping[str, str]  # versions.json
 
 
 class RunRequest(NamedTuple):
@@ -64,46 +57,132 @@ class RunRequest(NamedTuple):
     params: str | None  # `tree_hash` of the parameters of the net; None: not loaded yet
 
 
-def load_run(folder: Path) -> Run:
-    """Read a finished run.
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A run, finished or not: its files, each read when it is asked for.
 
-    Raises:
-        InputError: one line naming the file that is missing or is not a file of a run.
+    All of it raises an InputError, one line that names the file that is missing or is not a file
+    of a run.
     """
-    result, config, made_with = (read_object(folder / name) for name in (RESULT, CONFIG, VERSIONS))
-    if not isinstance(result.get("sets"), dict):
-        raise InputError(f"{folder / RESULT}: no `sets` in it; expected the result of a tuning")
-    config.pop("began", None)  # no setting
-    return Run(str(folder), result, read_histories(folder), flattened(config), made_with)
 
+    folder: Path  # as the user named it
 
-def read_request(folder: Path) -> RunRequest:
-    """Read the settings with which the run in a folder was started.
+    @property
+    def is_finished(self) -> bool:
+        """True if its verdict is written."""
+        return (self.folder / RESULT).exists()
 
-    Raises:
-        InputError: the folder is not the folder of a run.
-    """
-    config = read_object(folder / CONFIG)
-    if isinstance(flags := config.get("flags"), dict) and flags.get("walker"):
-        text = f"its walks are those of {flags['walker']}, its weights are in {folder}/weights"
-        raise InputError(f"{folder}: {text}")
-    try:
-        # a run that has just begun has written only its flags
-        flags, loss = config["flags"], config.get("tune", {}).get("loss", {})
-        return RunRequest(
-            trajectory=convert(flags["traj"], tuple[str, ...], name="traj")[0],
-            loss=named_loss(loss),
-            data=Path(flags["data"]),
-            net=flags["net"] and Path(flags["net"]),
-            variant=str(flags["variant"]),
-            robot=flags["robot"] and Path(flags["robot"]),
-            body=config["robot"],
-            params=config.get("net"),
-        )
-    except (LookupError, TypeError, AttributeError, ValueError) as error:
-        raise InputError(
-            f"{folder / CONFIG}: expected the settings of a run of `hector tune` ({error!r})"
-        ) from None
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """The flags, and the settings that follow from them."""
+        return read_object(self.folder / CONFIG)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The same with nested names joined by dots, without its time."""
+        return flattened({name: x for name, x in self.config.items() if name != "began"})
+
+    @cached_property
+    def made_with(self) -> Mapping[str, str]:
+        """Versions, machine and commit."""
+        return read_object(self.folder / VERSIONS)
+
+    @cached_property
+    def result(self) -> Mapping[str, Any]:
+        """The verdict of a finished run."""
+        result = read_object(self.folder / RESULT)
+        if not isinstance(result.get("sets"), dict):
+            text = "no `sets` in it; expected the result of a tuning"
+            raise InputError(f"{self.folder / RESULT}: {text}")
+        return result
+
+    @property
+    def histories(self) -> dict[str, list[Iteration]]:
+        """The iterations so far, by set; an incomplete last line is skipped."""
+        path, histories = self.folder / METRICS, {}
+        if path.exists():
+            for name, iteration in read_rows(path, "a tuning", _named_iteration):
+                histories.setdefault(name, []).append(iteration)
+        return histories
+
+    @cached_property
+    def request(self) -> RunRequest:
+        """The settings that it was started with, but for those of walks made elsewhere."""
+        flags = self.config.get("flags")
+        if isinstance(flags, dict) and flags.get("walker"):
+            text = f"its walks are those of {flags['walker']}, its weights are in"
+            raise InputError(f"{self.folder}: {text} {self.folder}/weights")
+        try:
+            # a run that has just begun has written only its flags
+            flags, loss = self.config["flags"], self.config.get("tune", {}).get("loss", {})
+            return RunRequest(
+                trajectory=convert(flags["traj"], tuple[str, ...], name="traj")[0],
+                loss=named_loss(loss),
+                data=Path(flags["data"]),
+                net=flags["net"] and Path(flags["net"]),
+                variant=str(flags["variant"]),
+                robot=flags["robot"] and Path(flags["robot"]),
+                body=self.config["robot"],
+                params=self.config.get("net"),
+            )
+        except (LookupError, TypeError, AttributeError, ValueError) as error:
+            text = f"expected the settings of a run of `hector tune` ({error!r})"
+            raise InputError(f"{self.folder / CONFIG}: {text}") from None
+
+    @property
+    def robot_file(self) -> Path | None:
+        """The file of its robot, also of a run whose walks are made elsewhere; None: HECTOR."""
+        flags = self.config.get("flags")
+        robot = flags.get("robot") if isinstance(flags, dict) else None
+        return robot and Path(robot)
+
+    @cached_property
+    def robot(self) -> Robot:
+        """Its robot, whose files must not have changed since."""
+        robot = load_robot(self.request.robot)
+        if self.request.body != robot_hash(robot):
+            text = f"{robot.description.path} or its MJCF has changed"
+            raise InputError(f"{self.folder} was tuned for another robot: {text}")
+        return robot
+
+    @cached_property
+    def controller(self) -> WalkConfig:
+        """The controller that it tunes."""
+        path = self.folder / CONFIG
+        try:
+            table = self.config["tune"]["rollout"]["walk"]
+        except (KeyError, TypeError) as error:
+            text = f"not the settings of a walking controller: {error!r}"
+            raise InputError(f"{path}: {text}") from error
+        # a setting that this version does not know is refused: the file goes to a robot
+        return from_table(f"{path}: tune.rollout.walk", WalkConfig, table)
+
+    def weights_file(self, name: str) -> Path:
+        """Return the file of a weight set; the error names the sets that there are."""
+        sets = sorted(path.stem for path in (self.folder / "weights").glob("*.json"))
+        if name not in sets:
+            raise InputError(f"{self.folder}: {unknown('weight set', name, sets)}")
+        return self.folder / "weights" / f"{name}.json"
+
+    def weights(self, name: str, robot: Robot | None = None) -> tuple[Weights, str]:
+        """Load a weight set, with its description in words.
+
+        Args:
+            name: name of a file in `weights/`; nominal or expert, which are always available; or
+                name of a tuning in progress, whose newest accepted weights are taken.
+            robot: robot of the nominal and expert weights; HECTOR by default.
+        """
+        path = self.folder / "weights" / f"{name}.json"
+        published = {"nominal": nominal, "expert": expert}
+        if path.exists():
+            return load_weights(path, robot), name
+        if name in published:
+            return published[name](robot), name
+        newest = _newest(self.histories)
+        if name in newest:
+            return newest[name].weights, f"{name} at iteration {newest[name].iteration}, so far"
+        names = sorted({*published, *newest, *(file.stem for file in path.parent.glob("*.json"))})
+        raise InputError(f"{self.folder} has no weight set {name!r}; it has {', '.join(names)}")
 
 
 def robot_file(folder: Path) -> Path | None:
@@ -114,7 +193,7 @@ def robot_file(folder: Path) -> Path | None:
 
 
 def as_row(name: str, iteration: Iteration) -> dict[str, Any]:
-    """Return an iteration as a row of metrics.jsonl, for `read_histories`."""
+    """Return an iteration as a row of metrics.jsonl, for `Run.histories`."""
     evaluation = iteration.evaluation
     gradient = jax.tree.map(np.multiply, evaluation.gradient, iteration.weights)
 
@@ -137,21 +216,6 @@ def as_row(name: str, iteration: Iteration) -> dict[str, Any]:
     if iteration.weights.others:  # others may be zero and have no logarithm
         row["gradient"] = dict(evaluation.gradient.others)
     return msgspec.to_builtins(row, enc_hook=lambda x: np.asarray(x).tolist())
-
-
-def read_histories(folder: Path) -> dict[str, list[Iteration]]:
-    """Read the iterations of a run so far, by set; empty if nothing was written yet.
-
-    An incomplete last line is skipped.
-
-    Raises:
-        InputError: one line naming the file and the line that is not an iteration.
-    """
-    path, histories = folder / METRICS, {}
-    if path.exists():
-        for name, iteration in read_rows(path, "a tuning", _named_iteration):
-            histories.setdefault(name, []).append(iteration)
-    return histories
 
 
 def _named_iteration(row: Mapping[str, Any]) -> tuple[str, Iteration]:
@@ -205,30 +269,6 @@ def flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         name = prefix + key
         flat |= flattened(value, f"{name}.") if isinstance(value, dict) else {name: value}
     return flat
-
-
-def weights_of(folder: Path, name: str, robot: Robot | None = None) -> tuple[Weights, str]:
-    """Load a weight set of a run, with its description in words.
-
-    Args:
-        folder: folder of the run.
-        name: name of a file in `weights/`; nominal or expert, which are always available; or name
-            of a tuning in progress, whose newest accepted weights are taken.
-        robot: robot of the nominal and expert weights; HECTOR by default.
-
-    Raises:
-        InputError: there is no such set; the message names the available sets.
-    """
-    path, published = folder / "weights" / f"{name}.json", {"nominal": nominal, "expert": expert}
-    if path.exists():
-        return load_weights(path, robot), name
-    if name in published:
-        return published[name](robot), name
-    newest = _newest(read_histories(folder))
-    if name in newest:
-        return newest[name].weights, f"{name} at iteration {newest[name].iteration}, so far"
-    names = sorted({*published, *newest, *(file.stem for file in path.parent.glob("*.json"))})
-    raise InputError(f"{folder} has no weight set {name!r}; it has {', '.join(names)}")
 
 
 def _newest(histories: Histories) -> dict[str, Iteration]:

@@ -1,0 +1,146 @@
+"""`hector log foretell`: what other weights would bring on the robot of a log, with intervals."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from hector_jax.cli import arguments
+from hector_jax.cli.arguments import print_result
+from hector_jax.cli.flags import Foretell
+from hector_jax.control.reference import Command
+from hector_jax.core.console import say
+from hector_jax.core.inputs import InputError
+from hector_jax.own.log_check import check_log, read_check
+from hector_jax.own.planner import call_planner
+from hector_jax.own.walk_file import read_walk, reference_of
+from hector_jax.own.walk_log import at_ticks, log_of
+from hector_jax.robot.description import HECTOR
+from hector_jax.robot.model import Robot, load_robot
+from hector_jax.store import tunings
+from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.verdict import metrics
+from hector_jax.verdict.foretell import (
+    COVERAGE,
+    ELSEWHERE,
+    HERE,
+    Foretold,
+    forecast,
+    foretell,
+    quantities,
+)
+from hector_jax.verdict.metrics import Interval
+
+_SHOWN: dict[str, tuple[str, float]] = {
+    "plane": ("plane [cm]", 100.0),
+    "height": ("height [cm]", 100.0),
+    "pitch": ("pitch [deg]", 180.0 / np.pi),
+    "yaw": ("yaw [deg]", 180.0 / np.pi),
+}
+"""Errors by name: their column, and the factor of its unit."""
+
+
+def run_foretell(args: Foretell) -> None:
+    """Foretell the walks of weight sets on the robot of some logs."""
+    robot = load_robot(args.robot)
+    trajectory = arguments.load_trajectory(args.traj, robot)
+    config = arguments.with_length(tunings.tune_config(robot), trajectory)
+    walked = arguments.weights_by_name(args.walked, robot)
+    names = arguments.short_names(args.weights)
+    sets = {names[text]: arguments.weights_by_name(text, robot) for text in args.weights}
+    planner = arguments.planner_of(args)
+    options = {"call": planner and partial(call_planner, planner)}
+    say("compiling (only the first time on a machine) and foretelling")
+    logged, found = [], []
+    for path in args.logs:
+        walk, score = _read(path, config, robot, trajectory.command)
+        logged.append(quantities(score))
+        found.append(foretell(config, robot, trajectory.command, walk, walked, sets, **options))
+    is_here = robot.description == HECTOR and planner is None and all(map(_is_ours, args.logs))
+    group = HERE if is_here else ELSEWHERE
+    result = {
+        "walked": {"name": args.walked, **_mean(logged)},
+        "sets": {name: _set_result(found, name, group, _mean(logged)) for name in sets},
+        "calibration": group,
+    }
+    print_result(args.json, result, lambda: print(*_lines(result, len(found)), sep="\n"))
+
+
+def _read(path: Path, config: TuneConfig, robot: Robot, command: Command) -> tuple[Any, Any]:
+    """Return a log at the plan interval and the score of its walk.
+
+    Raises:
+        InputError: it has faults that no weight can mend, so that it foretells nothing; or it fell.
+    """
+    controller = config.rollout.walk
+    tick, seconds = controller.gait.tick, config.rollout.ticks * controller.gait.tick
+    checked, _ = read_check(path, robot, command, seconds, tick)
+    if faults := check_log(checked, controller.plan_interval):
+        raise InputError(f"{path} foretells nothing: {faults[0]}")
+    walk, end = read_walk(path, robot, seconds, tick)
+    if end:
+        raise InputError(f"{path} foretells nothing: {end}")
+    reference = jax.tree.map(np.asarray, reference_of(tick, robot, command, walk))
+    score = metrics.score(config.loss, walk._replace(reference=reference))
+    return at_ticks(log_of(walk), tick), score
+
+
+def _is_ours(path: Path) -> bool:
+    """Tell whether `hector walk` wrote a log, in MuJoCo."""
+    with np.load(path, allow_pickle=False) as archive:
+        card = str(archive["card"]) if "card" in archive.files else ""
+    return '"engine": "c"' in card and '"kind": "trajectory"' in card
+
+
+def _mean(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Return geometric means of the quantities of some walks."""
+    return {name: float(np.exp(np.mean([np.log(row[name]) for row in rows]))) for name in rows[0]}
+
+
+def _set_result(
+    found: Sequence[Foretold], name: str, group: str, logged: Mapping[str, float]
+) -> dict[str, Any]:
+    """Return what logs foretell of a set as JSON values: each quantity, its change, its margins."""
+    each = [forecast(one, name, group) for one in found]
+    tilts, heights = zip(*(one.margins[name] for one in found), strict=True)
+    result: dict[str, Any] = {"tilt": max(tilts), "height_over_limit": min(heights)}
+    for quantity in each[0]:
+        ratio = np.mean([one[quantity] for one in each], axis=0)  # with the ends of its interval
+        value, change = logged[quantity] * np.exp(ratio), 100.0 * np.expm1(ratio)
+        keys = "value", "low", "high"
+        result[quantity] = dict(zip(keys, value.tolist(), strict=True)) | {
+            "change": dict(zip(keys, change.tolist(), strict=True)),
+            "logs": [100.0 * float(np.expm1(one[quantity].value)) for one in each],
+        }
+    return result
+
+
+def _lines(result: Mapping[str, Any], logs: int) -> Iterator[str]:
+    """Return the lines of a forecast: a table, the falls, and what the intervals rest on."""
+    head = ["set", *(title for title, _ in _SHOWN.values()), "L [%]"]
+    errors = [f"{result['walked'][name] * factor:.1f}" for name, (_, factor) in _SHOWN.items()]
+    rows = [head, [f"{result['walked']['name']} (walked)", *errors, ""]]
+    for name, row in result["sets"].items():
+        cells = [
+            _text(row[x], lambda v, f=factor: f"{v * f:.1f}") for x, (_, factor) in _SHOWN.items()
+        ]
+        rows.append([name, *cells, _text(row["L"]["change"], metrics.percent)])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for first, *others in rows:
+        cells = [text.rjust(width) for text, width in zip(others, widths[1:], strict=True)]
+        yield "  ".join([first.ljust(widths[0]), *cells])
+    of = "HECTOR in this simulator" if result["calibration"] == HERE else "other robots and engines"
+    yield f"in brackets {100 * COVERAGE:.0f} % intervals, by forecasts that were walked: {of}"
+    if logs > 1:
+        yield f"means of {logs} logs"
+    for name, row in result["sets"].items():
+        tilt, height = 100 * row["tilt"], row["height_over_limit"]
+        text = f"its foretold walk tilts to {tilt:.0f} % of a fall's angle, the trunk stays at"
+        yield f"falls of {name} are not foretold; {text} {height:.1f} times a fall's height"
+
+
+def _text(values: Mapping[str, float], write: Callable[[float], str]) -> str:
+    return Interval(*(values[key] for key in ("value", "low", "high"))).text(write)

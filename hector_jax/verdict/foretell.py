@@ -1,0 +1,175 @@
+"""What weights that never walked on a robot would bring there, foretold from a log of one that did.
+
+The rigid body grounded on the log walks with the other weights (tuning/grounded.py). How far such a
+forecast is off was measured: `foretold.json`, written by experiments/foretell.py, has pairs of what
+was foretold and what was walked, as logarithms of the ratio to the walk of the log. Their quantiles
+make the interval (split conformal prediction, Vovk et al. 2005): of plants that are drawn as those
+of the pairs it holds the given share, whatever the distribution. Falls are not foretold.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from hector_jax.control.parameters import steps_between
+from hector_jax.control.reference import Command, standing_anchor
+from hector_jax.control.weights import Weights
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import read_json
+from hector_jax.core.trajectory import SOLVED
+from hector_jax.grfm import network
+from hector_jax.own.planner import called_plans, plan_inputs
+from hector_jax.own.walk_log import Log, trajectory_of
+from hector_jax.robot.model import Robot
+from hector_jax.tuning.called import CallPlans
+from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
+from hector_jax.tuning.rollout import Scenario
+from hector_jax.verdict import metrics
+from hector_jax.verdict.metrics import Interval, Score
+
+COVERAGE = 0.9  # of an interval
+FEWEST = 40  # pairs of a group: below that it has no interval
+_FLOOR = 0.3  # of a log ratio: errors of a forecast grow with what it foretells beyond this
+_PAIRS = Path(__file__).with_name("foretold.json")
+
+HERE, ELSEWHERE = "here", "elsewhere"
+"""Groups of pairs: HECTOR in MuJoCo; other robots and engines, for logs made elsewhere."""
+
+
+class Foretold(NamedTuple):
+    """Walks that a log foretells."""
+
+    scores: dict[str, Score]  # by set
+    margins: dict[str, tuple[float, float]]  # by set: largest tilt and lowest height, see `margin`
+    walked: Score  # of the log, as the grounded rollout repeats it
+    distances: dict[str, float]  # of the weights from those of the log, see `distance`
+
+
+def quantities(score: Score) -> dict[str, float]:
+    """Return what is foretold of a walk: L, errors [m], [rad], and L_ctrl if the loss has it."""
+    euler, position = np.asarray(score.rms_euler), np.asarray(score.rms_position)
+    found = {"L": float(score.L), "plane": float(np.hypot(*position[:2])), "height": position[2]}
+    found |= {"pitch": euler[1], "yaw": euler[2]}
+    smooth = {"L_ctrl": score.losses["L_ctrl"]} if "L_ctrl" in score.losses else {}
+    return {name: float(x) for name, x in {**found, **smooth}.items()}
+
+
+def distance(walked: Weights, weights: Weights) -> float:
+    """Return the root mean square of the logarithms of the ratios of Q and R."""
+    return float(np.sqrt(np.mean(np.square(steps_between(walked, weights)))))
+
+
+def foretell(
+    config: TuneConfig,
+    robot: Robot,
+    command: Command,
+    log: Log,
+    walked: Weights,
+    sets: Mapping[str, Weights],
+    *,
+    call: CallPlans | None = None,
+) -> Foretold:
+    """Foretell the walks of weight sets on the robot of a log.
+
+    Args:
+        config: controller, loss, and a rollout as long as the log.
+        robot, command: that walked, and what was asked of it.
+        log: at the plan interval, without a fall.
+        walked: weights of the log.
+        sets: weights by name.
+        call: plans of a controller that is known by calling it.
+
+    Raises:
+        InputError: the robot fell in the log; or a plan of a foretold walk is not solved.
+    """
+    if log.fallen.any():
+        raise InputError("the robot fell in the log: it foretells nothing")
+    scenario = Scenario(
+        robot, command, standing_anchor(robot), network.effect_of(None, config.rollout.walk)
+    )
+    walk, called = trajectory_of(log), None
+    if call is not None:
+        inputs = plan_inputs(config.rollout.walk, robot, walked, command, walk)
+        called = called_plans(call, config.rollout.walk, inputs)
+    grounding = fit_grounding(config.rollout, scenario, walked, walk, called=called)
+    scores, margins, limits = {}, {}, robot.description.limits
+    for name, weights in {"": walked, **sets}.items():
+        full = weights._replace(others={**walked.others, **weights.others})
+        found = jax.device_get(_rollout(config.rollout, grounding, full))
+        if not np.max(found.residual) <= SOLVED:
+            raise InputError(f"{name or 'the log'}: a plan of the foretold walk is not solved")
+        scores[name] = metrics.score(config.loss, found)
+        margins[name] = margin(limits, found.state.euler, found.state.position)
+    away = {name: distance(walked, weights) for name, weights in sets.items()}
+    return Foretold(scores, margins, scores.pop(""), away)
+
+
+_rollout = partial(jax.jit, static_argnums=0)(grounded_rollout)
+
+
+def margin(
+    limits: tuple[float, float],
+    euler: Float[np.ndarray, "T 3"],
+    position: Float[np.ndarray, "T 3"],
+) -> tuple[float, float]:
+    """Return the largest tilt as a share of the limit of a fall, and the lowest height over its.
+
+    Args:
+        limits: lowest height [m] and largest tilt [rad] of a robot that has not fallen.
+        euler, position: of a walk.
+    """
+    tilt, height = np.abs(euler[:, :2]).max() / limits[1], position[:, 2].min() / limits[0]
+    return float(tilt), float(height)
+
+
+def calibrated(group: str) -> dict[str, Sequence[Sequence[float]]]:
+    """Return the measured pairs of a group by quantity: (foretold, walked) log ratios."""
+    return _calibration()["pairs"][group]["pairs"]
+
+
+@cache
+def _calibration() -> dict[str, Any]:
+    return read_json(_PAIRS, "the measured errors of forecasts")
+
+
+def interval(foretold: float, pairs: Sequence[Sequence[float]]) -> Interval:
+    """Return the interval of a walked log ratio around a foretold one; NaN with few pairs.
+
+    >>> pairs = [(-1.0, -1.0 + 0.011 * k) for k in range(-50, 51)]
+    >>> [round(x, 2) for x in interval(-0.9, pairs)]
+    [-0.9, -1.36, -0.44]
+    """
+    if len(pairs) < FEWEST:
+        return Interval(foretold, np.nan, np.nan)
+    of_pairs, truth = np.asarray(pairs, float).T
+    ordered = np.sort((truth - of_pairs) / (_FLOOR + np.abs(of_pairs)))
+    outside = int(np.floor((len(ordered) + 1) * (1.0 - COVERAGE) / 2.0))  # on each side
+    ends = ordered[[max(outside - 1, 0), min(len(ordered) - outside, len(ordered) - 1)]]
+    low, high = foretold + ends * (_FLOOR + abs(foretold))
+    return Interval(foretold, float(low), float(high))
+
+
+def forecast(foretold: Foretold, name: str, group: str) -> dict[str, Interval]:
+    """Return the change of each quantity of a set against the walk of the log, as log ratios.
+
+    Args:
+        foretold: of one log.
+        name: of the set.
+        group: HERE or ELSEWHERE.
+
+    Raises:
+        InputError: the weights are farther from those of the log than any that was measured.
+    """
+    far, farthest = foretold.distances[name], _calibration()["pairs"][group]["farthest"]
+    if far > farthest:
+        text = f"forecasts were measured up to {np.exp(farthest):.1f} times"
+        raise InputError(f"{name}: {np.exp(far):.1f} times the weights of the log (RMS); {text}")
+    before, after = quantities(foretold.walked), quantities(foretold.scores[name])
+    ratios = {x: float(np.log(after[x] / before[x])) for x in after}
+    return {x: interval(ratio, calibrated(group).get(x, [])) for x, ratio in ratios.items()}
