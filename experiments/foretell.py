@@ -129,7 +129,7 @@ def log_job(case: Case, count: int) -> list[Pair]:
     if np.any(logged.fallen):
         return []
     try:
-        found = foretell(config, robot, command, log, walked, named)
+        found = foretell(config, robot, command, log, named, walked=walked)
     except InputError:
         return []
     before, pairs = quantities(metrics.score(config.loss, logged)), []

@@ -41,7 +41,7 @@ int main(int count, char **words) {
         measure(m, d, &estimate);
         if (ms == CONTROLLER_TICK_0) /* before, it steps in place */
             controller_drive(&controller, 0.3, 0.0, 0.5);
-        controller_step(&controller, ms, &estimate, NULL, NULL, &output);
+        controller_step(&controller, &estimate, NULL, NULL, &output);
         if (output.status != CONTROLLER_SOLVED && output.status != CONTROLLER_NOT_UNIQUE)
             ++unsolved; /* on a robot: see docs/export.md */
         mju_copy(d->ctrl, output.torque, CONTROLLER_JOINTS); /* on a robot: to its motors */

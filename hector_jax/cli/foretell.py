@@ -52,13 +52,13 @@ def run_foretell(args: Foretell) -> None:
     names = arguments.short_names(args.weights)
     sets = {names[text]: arguments.weights_by_name(text, robot) for text in args.weights}
     planner = arguments.planner_of(args)
-    options = {"call": planner and partial(call_planner, planner)}
+    options: dict[str, Any] = {"call": planner and partial(call_planner, planner), "walked": walked}
     say("compiling (only the first time on a machine) and foretelling")
     logged, found = [], []
     for path in args.logs:
         walk, score = _read(path, config, robot, trajectory.command)
         logged.append(quantities(score))
-        found.append(foretell(config, robot, trajectory.command, walk, walked, sets, **options))
+        found.append(foretell(config, robot, trajectory.command, walk, sets, **options))
     is_here = robot.description == HECTOR and planner is None and all(map(_is_ours, args.logs))
     group = HERE if is_here else ELSEWHERE
     result = {

@@ -70,9 +70,9 @@ def foretell(
     robot: Robot,
     command: Command,
     log: Log,
-    walked: Weights,
     sets: Mapping[str, Weights],
     *,
+    walked: Weights,
     call: CallPlans | None = None,
 ) -> Foretold:
     """Foretell the walks of weight sets on the robot of a log.
@@ -81,8 +81,8 @@ def foretell(
         config: controller, loss, and a rollout as long as the log.
         robot, command: that walked, and what was asked of it.
         log: at the plan interval, without a fall.
-        walked: weights of the log.
         sets: weights by name.
+        walked: weights of the log.
         call: plans of a controller that is known by calling it.
 
     Raises:
