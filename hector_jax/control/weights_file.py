@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hector_jax.control.parameters import COST, TUNABLES, tunable
+from hector_jax.control.parameters import COST, TUNABLES, numbers_of, tunable
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, unknown
@@ -61,7 +61,8 @@ def best(robot: Robot | None = None) -> Weights:
 def load_weights(path: Path, robot: Robot | None = None) -> Weights:
     """Read weights that `save_weights` or a person wrote.
 
-    Q and R have to be in the range `WEIGHTS`, `others` in their bounds in `TUNABLES`.
+    Q and R have to be in the range `WEIGHTS`, `others` in their bounds in `TUNABLES`, or in those
+    of the robot's numbers, which start as its description says.
 
     Args:
         path: JSON file.
@@ -83,6 +84,7 @@ def load_weights(path: Path, robot: Robot | None = None) -> Weights:
     given = tree.get("others") if isinstance(tree, dict) else None
     costs = [n for n in given if n.startswith(COST)] if isinstance(given, dict) else []
     numbers = {name: tunable(name) for name in (*TUNABLES, *costs)}
+    numbers |= {of.name: of for of in numbers_of(robot.description)} if robot else {}
     others = {n: (x.shape(robot), Range(x.lower, x.upper)) for n, x in numbers.items()}
     _check_keys(path, tree, (*parts, "others", "$schema"), parts)  # a schema is for editors
     values = {}
@@ -95,7 +97,14 @@ def load_weights(path: Path, robot: Robot | None = None) -> Weights:
             name: _numbers(path, f"{part}.{name}", value, *entries[name])
             for name, value in given.items()
         }
-    return Weights(State(**values["Q"]), like.R._replace(**values["R"]), values["others"])
+    weights = Weights(State(**values["Q"]), like.R._replace(**values["R"]), values["others"])
+    return with_numbers(weights, robot) if robot else weights
+
+
+def with_numbers(weights: Weights, robot: Robot) -> Weights:
+    """Return weights with the robot's numbers that they lack, at their start."""
+    starts = {name: np.asarray(number.start) for name, number in robot.description.numbers}
+    return weights._replace(others={**starts, **weights.others})
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

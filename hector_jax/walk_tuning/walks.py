@@ -11,6 +11,7 @@ anew in each call and no walk is made twice:
 - `walks.jsonl`: the settings, then a line for each weight set that has walked.
 - `weights/3.json`: the weights of set 3.
 - `logs/3-0.npz`: its log in case 0, at the plan interval, or the file that was added.
+- `logs/3-KP-0.npz`: the same with the number KP moved (`moved`).
 - `starts/with`: the same of a set that was tried as the start.
 """
 
@@ -28,6 +29,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hector_jax.control import parameters
+from hector_jax.control.parameters import Tunable
 from hector_jax.control.reference import standing_anchor
 from hector_jax.control.weights import Weights
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
@@ -51,6 +53,7 @@ from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
 from hector_jax.tuning.rollout import Scenario
 from hector_jax.tuning.status import StepStatus
 from hector_jax.walk_tuning.campaign import Campaign
+from hector_jax.walk_tuning.moved import STEP, Moved, columns, numbers_by_walks
 
 RECORD = "walks.jsonl"
 START_PLANTS = 3  # on which several starts walk
@@ -95,6 +98,10 @@ class Waiting(Exception):  # noqa: N818
     """The walks of a weight set have not been made yet."""
 
 
+class Spent(Exception):  # noqa: N818
+    """No walks are left for another set."""
+
+
 Ask = Callable[[int, Weights], Sequence[ScoredLog]]
 """Returns the scored logs of a set by its number, one for each case, or raises `Waiting`."""
 
@@ -122,11 +129,16 @@ def walk_case(campaign: Campaign, weights: Weights, case: int) -> ScoredLog:
 
 
 def _slope(
-    campaign: Campaign, weights: Weights, case: int, log: Log
+    campaign: Campaign,
+    weights: Weights,
+    case: int,
+    log: Log,
+    moved: Mapping[str, tuple[float, Log, Log]],
 ) -> tuple[Evaluation, Float[np.ndarray, "n n"]] | InputError:
     """Return loss, gradient and matrix of the plain rigid body grounded on a walk.
 
-    If the planner of the user gives no plans of it this returns its error: others may go on.
+    By the numbers that were `moved` they are by walks, see `moved.columns`. If the planner of the
+    user gives no plans of it this returns its error: others may go on.
     """
     config, robot = campaign.config, campaign.robot
     effect = network.effect_of(None, config.rollout.walk)
@@ -136,18 +148,21 @@ def _slope(
         controller = config.rollout.walk
         inputs = plan_inputs(controller, robot, weights, scenario.command, walk)
         try:
-            called = called_plans(partial(call_planner, campaign.planner), controller, inputs)
+            plans = partial(call_planner, campaign.planner)
+            numbers = [x for x in config.others if isinstance(x, Tunable) and not x.of_legs]
+            called = called_plans(plans, controller, inputs, numbers)
         except InputError as error:
             return error
     grounding = fit_grounding(config.rollout, scenario, weights, walk, called=called)
-    options = {"walk": grounded_rollout, "others": config.others}
+    J = columns(config, robot, scenario.command, weights, moved)
+    options = {"walk": grounded_rollout, "others": config.others, "columns": J}
     found = least_squares_jit(config.rollout, grounding, weights, config.loss, **options)
     return jax.device_get(found)
 
 
 def first_slope(campaign: Campaign) -> None:
     """Compile the programs of the tuning, of which this walk is none, into the cache."""
-    _slope(campaign, campaign.start, 0, walk_case(campaign, campaign.start, 0).log)
+    _slope(campaign, campaign.start, 0, walk_case(campaign, campaign.start, 0).log, {})
 
 
 # The choice of the start
@@ -199,12 +214,27 @@ def _bounded_logs(
 class _Walks:
     """The objective of `difftune.descend` on walks; remembers the sets."""
 
-    def __init__(self, pool: Executor, campaign: Campaign, ask: Ask) -> None:
+    def __init__(
+        self, pool: Executor, campaign: Campaign, ask: Ask, walks: int | None = None
+    ) -> None:
         self.pool, self.campaign, self.ask = pool, campaign, ask
         self.losses: list[np.ndarray] = []
+        self.left = np.inf if walks is None else walks
+        self.state: TuneState | None = None
+        self.moved: dict[str, Moved] = {}  # the latest walks of each number, the oldest first
 
     def place(self, state: TuneState) -> TuneState:
-        """Return the state at the set that has walked, should the code place it elsewhere."""
+        """Return the state at the set that has walked, should the code place it elsewhere.
+
+        Raises:
+            Spent: it cannot walk.
+        """
+        if self.left < len(self.campaign.cases):
+            raise Spent
+        self.state = self._placed(state)
+        return self.state
+
+    def _placed(self, state: TuneState) -> TuneState:
         path = weights_path(self.campaign.folder, len(self.losses))
         config = self.campaign.config
         trial = jax.device_get(difftune.trial_weights(config, state))
@@ -223,6 +253,7 @@ class _Walks:
         """Walk a set; value and slope of the mean of log L."""
         campaign, number = self.campaign, len(self.losses)
         logs = self.ask(number, weights)
+        self.left -= len(logs)
         losses = np.array([walked.loss for walked in logs])
         stood = np.isfinite(losses)
         self.losses.append(losses)
@@ -230,7 +261,13 @@ class _Walks:
         refused = stood.sum() < np.isfinite(self.losses[0]).sum()
         on = [] if refused else np.flatnonzero(stood).tolist()  # a slope takes as long as a walk
         some = [logs[case].log for case in on]
-        found = list(self.pool.map(_slope, repeat(campaign), repeat(weights), on, some))
+        if on and self._gains(weights, value):
+            self._move(weights, dict(zip(on, some, strict=True)))
+        moved = [
+            {n: (x.step, x.before[c], x.after[c]) for n, x in self.moved.items() if c in x.after}
+            for c in on
+        ]
+        found = list(self.pool.map(_slope, repeat(campaign), repeat(weights), on, some, moved))
         errors = [x for x in found if isinstance(x, InputError)]
         if errors and len(errors) == len(found) and not number:
             raise errors[0]
@@ -251,6 +288,30 @@ class _Walks:
             residual = np.max([found.residual for found, _ in usable])
         return Evaluation(np.asarray(value), {}, gradient, fallen, np.asarray(residual)), matrix
 
+    def _gains(self, weights: Weights, value: float) -> bool:
+        """Return whether a set that stood is accepted."""
+        zero = np.zeros(())
+        found = Evaluation(np.asarray(value), {}, jax.tree.map(np.zeros_like, weights), zero, zero)
+        assert self.state is not None  # it was placed
+        status = difftune.trial_status(self.campaign.config, self.state, found)
+        return int(status) == StepStatus.ACCEPTED
+
+    def _move(self, weights: Weights, stood: Mapping[int, Log]) -> None:
+        """Walk a set again with numbers moved, unless no walks are left for a set after that."""
+        campaign, number = self.campaign, len(self.losses) - 1
+        numbers = {of.name: of for of in numbers_by_walks(campaign.config)}
+        due = list(self.moved)[:1] or list(numbers)
+        if self.left < len(due) * len(stood) + len(campaign.cases):
+            return
+        self.left -= len(due) * len(stood)
+        nudges = {name: parameters.nudged(weights, numbers[name], STEP) for name in due}
+        sets = {f"{number}-{name}": moved for name, (moved, _) in nudges.items()}
+        found = walk_sets(self.pool, campaign, sets, list(stood))
+        for name, walked in zip(due, found.values(), strict=True):
+            after = {case: x.log for case, x in walked.items() if np.isfinite(x.loss)}
+            self.moved.pop(name, None)
+            self.moved[name] = Moved(nudges[name][1], stood, after)
+
 
 def tune_on_walks(
     pool: Executor, campaign: Campaign, ask: Ask | None = None, walks: int | None = None
@@ -261,7 +322,8 @@ def tune_on_walks(
         pool: worker processes.
         campaign: the settings.
         ask: makes the walks of a set; by default the engine of the campaign does.
-        walks: budget; whole sets walk in all cases. None: the iterations of the settings.
+        walks: budget, of those with numbers moved too; whole sets walk in all cases. None: the
+            iterations of the settings.
 
     Returns:
         The sets; if the start falls in all cases it alone.
@@ -274,7 +336,7 @@ def tune_on_walks(
     config, cases = campaign.config, len(campaign.cases)
     if walks is not None:
         config = replace(config, iterations=max(walks // cases - 1, 1))
-    objective = _Walks(pool, campaign, ask or partial(walk_all, pool, campaign))
+    objective = _Walks(pool, campaign, ask or partial(walk_all, pool, campaign), walks)
     sets: list[WalkedSet] = []
     with bar(f"tuning on walks, {plural(cases, 'case')}") as report_progress:
 
@@ -298,6 +360,8 @@ def tune_on_walks(
             write_record()  # without sets whose logs were taken back
             waiting = load_weights(weights_path(campaign.folder, len(sets)), campaign.robot)
             return WalkTuning(sets, waiting, "")
+        except Spent:
+            return WalkTuning(sets, None, f"no more of its {plural(walks or 0, 'walk')} are left")
         except InputError:
             if sets and not sets[0].accepted:
                 return WalkTuning(sets, None, "the start fell or was not solved in all walks")
@@ -318,7 +382,7 @@ def _head(campaign: Campaign) -> dict[str, Any]:
         "start": weights_tree(campaign.start),
         "commands": {name: tree_hash(command) for name, command in campaign.commands.items()},
         "plants": [plant and tree_hash(plant) for plant in campaign.plants],
-        "numbers": list(campaign.config.others),
+        "numbers": list(map(parameters.name_of, campaign.config.others)),
         "seconds": campaign.seconds,
     }
     if campaign.by_logs:  # data: neither code nor loss can make them those of another campaign
@@ -332,17 +396,27 @@ def _head(campaign: Campaign) -> dict[str, Any]:
     }
 
 
+def walk_sets(
+    pool: Executor, campaign: Campaign, sets: Mapping[str, Weights], cases: Sequence[int]
+) -> dict[str, dict[int, ScoredLog]]:
+    """Walk sets by name in some cases, and keep each walk in the folder as it ends."""
+    robot = campaign.robot
+    like = ScoredLog(0.0, log_of(no_samples(len(robot.joint_lower), len(robot.foot_point))))
+    paths = {(n, case): log_paths(campaign, n)[case] for n in sets for case in cases}
+    missing = [at for at, path in paths.items() if not path.exists()]
+    running = {pool.submit(walk_case, campaign, sets[n], case): (n, case) for n, case in missing}
+    for job in as_completed(running):
+        save_tree(paths[running[job]], job.result(), kind="log", robot=robot)
+    logs = {at: load_tree(x, like, kind="log", robot=robot)[0] for at, x in paths.items()}
+    return {name: {case: logs[name, case] for case in cases} for name in sets}
+
+
 def walk_all(
     pool: Executor, campaign: Campaign, number: int, weights: Weights
 ) -> Sequence[ScoredLog]:
-    """Walk a set in all cases, and keep each walk in the folder as it ends."""
-    robot, paths = campaign.robot, log_paths(campaign, number)
-    like = ScoredLog(0.0, log_of(no_samples(len(robot.joint_lower), len(robot.foot_point))))
-    missing = [case for case, path in enumerate(paths) if not path.exists()]
-    running = {pool.submit(walk_case, campaign, weights, case): case for case in missing}
-    for job in as_completed(running):
-        save_tree(paths[running[job]], job.result(), kind="log", robot=robot)
-    return [load_tree(path, like, kind="log", robot=robot)[0] for path in paths]
+    """Walk a set in all cases."""
+    found = walk_sets(pool, campaign, {str(number): weights}, range(len(campaign.cases)))
+    return list(found[str(number)].values())
 
 
 def weights_path(folder: Path, number: int) -> Path:
@@ -350,7 +424,7 @@ def weights_path(folder: Path, number: int) -> Path:
     return folder / "weights" / f"{number}.json"
 
 
-def log_paths(campaign: Campaign, number: int) -> list[Path]:
+def log_paths(campaign: Campaign, name: int | str) -> list[Path]:
     """Return the files of the logs of a set, one for each case."""
-    names = [f"{number}-{case}.npz" for case in range(len(campaign.cases))]
+    names = [f"{name}-{case}.npz" for case in range(len(campaign.cases))]
     return [campaign.folder / "logs" / name for name in names]
