@@ -23,6 +23,7 @@ from hector_jax.cli.flags import (
 from hector_jax.control import trajectories
 from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import gait_named
+from hector_jax.control.parameters import Tunable, numbers_of
 from hector_jax.control.reference import COMMANDS
 from hector_jax.control.trajectories import NamedCommand, beyond, limits
 from hector_jax.control.weights import Weights, expert, nominal
@@ -86,6 +87,12 @@ def planner_of(args: ByPlanner) -> Program | None:
         return None
     settings = args if isinstance(args, ByWalker) else ByWalker()
     return program_of(args.planner, settings.walker_limit, settings.walker_uses)
+
+
+def own_numbers(args: ByPlanner, robot: Robot) -> tuple[Tunable, ...]:
+    """Return the robot's numbers; without a planner all are as those of the legs, by walks."""
+    numbers = numbers_of(robot.description)
+    return numbers if args.planner else tuple(x._replace(path="legs") for x in numbers)
 
 
 def short_names(texts: Sequence[str]) -> dict[str, str]:

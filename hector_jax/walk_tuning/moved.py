@@ -6,7 +6,7 @@ derivative that `curvature.least_squares` takes. In the first set all are moved.
 little from set to set: later ones move the number whose walks are the oldest.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import jax
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.control.parameters import Tunable, step_names
+from hector_jax.control.parameters import Other, Tunable, step_names
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights
 from hector_jax.own.walk_file import reference_of
@@ -34,9 +34,9 @@ class Moved(NamedTuple):
     after: Mapping[int, Log]
 
 
-def numbers_by_walks(config: TuneConfig) -> list[Tunable]:
+def numbers_by_walks(others: Iterable[Other]) -> list[Tunable]:
     """Return the numbers of a tuning whose slopes are by walks."""
-    return [x for x in config.others if isinstance(x, Tunable) and x.of_legs]
+    return [x for x in others if isinstance(x, Tunable) and x.of_legs]
 
 
 def walks_needed(cases: int, numbers: int) -> tuple[int, int]:

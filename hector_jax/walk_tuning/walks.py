@@ -299,7 +299,7 @@ class _Walks:
     def _move(self, weights: Weights, stood: Mapping[int, Log]) -> None:
         """Walk a set again with numbers moved, unless no walks are left for a set after that."""
         campaign, number = self.campaign, len(self.losses) - 1
-        numbers = {of.name: of for of in numbers_by_walks(campaign.config)}
+        numbers = {of.name: of for of in numbers_by_walks(campaign.config.others)}
         due = list(self.moved)[:1] or list(numbers)
         if self.left < len(due) * len(stood) + len(campaign.cases):
             return
