@@ -34,7 +34,7 @@ from hector_jax.robot.model import load_robot
 from hector_jax.sim.margin import delay_lines
 from hector_jax.store.nets import CollectConfig
 from hector_jax.walk_tuning import best_set
-from hector_jax.walk_tuning.walks import START_PLANTS
+from hector_jax.walk_tuning.starts import START_PLANTS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -1,12 +1,13 @@
 """Slopes by walks, of the numbers of a user's controller that its legs use.
 
 No plan has them. So a set that is accepted walks again on the same plants with one of them moved;
-the difference of the residuals of the two walks, divided by the step, is a column of the
-derivative that `curvature.least_squares` takes. In the first set all are moved. A column changes
-little from set to set: later ones move the number whose walks are the oldest.
+the change of the residuals from walk to walk (`changed_by`), divided by the step, is a column of
+the derivative that `curvature.least_squares` takes. In the first set all are moved. A column
+changes little from set to set: later ones move the number whose walks are the oldest.
 """
 
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -14,16 +15,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.control.parameters import Other, Tunable, step_names
+from hector_jax.control.parameters import Other, Tunable, name_of
 from hector_jax.control.reference import Command
-from hector_jax.control.weights import Weights
+from hector_jax.control.weights import direction_names, nominal
 from hector_jax.own.walk_file import reference_of
 from hector_jax.own.walk_log import Log, trajectory_of
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.loss import residuals
 
 STEP = 0.1  # of a number, see `parameters.stepped`
+SPAN = 0.5  # [s] of which the mean of a residual changes as it is: about a gait cycle
 
 
 class Moved(NamedTuple):
@@ -49,36 +50,60 @@ def walks_needed(cases: int, numbers: int) -> tuple[int, int]:
     return cases * (1 + numbers), cases * (1 + min(numbers, 1))
 
 
-def residual_rows(
+def residuals_of(
     config: TuneConfig, robot: Robot, command: Command, log: Log
-) -> Float[np.ndarray, " rows"]:
-    """Return the residuals of a log, of all ticks but the first as in `grounded_rollout`."""
+) -> list[Float[np.ndarray, "T channels"]]:
+    """Return the residuals of each term, of all ticks but the first as in `grounded_rollout`."""
     reference = reference_of(config.rollout.walk.gait.tick, robot, command, log)
     walk = trajectory_of(log)._replace(reference=reference)
     later = jax.tree.map(lambda x: jnp.asarray(x)[1:], walk._replace(period=None, initial=None))
     later = later._replace(period=jnp.asarray(walk.period), initial=walk.initial)
-    return np.asarray(residuals(config.loss, later))
+    terms = [np.sqrt(term.weight) * np.asarray(term.of(later)) for term in config.loss]
+    return [x.reshape(len(x), -1) for x in terms]
+
+
+def changed_by(
+    now: Float[np.ndarray, "T channels"],
+    before: Float[np.ndarray, "T channels"],
+    after: Float[np.ndarray, "T channels"],
+    span: int,
+) -> Float[np.ndarray, "T channels"]:
+    """Return by how much a move changes the residuals of a walk, from its changes in two walks.
+
+    Within each span of samples their mean changes as it did, and what is left, the ripple of the
+    steps, by its size alone: two walks with other steps are out of step after some of them, and the
+    difference of their ripples would tell that and not which is larger.
+    """
+    changes = []
+    for rows in np.array_split(np.arange(len(now)), max(len(now) // span, 1)):
+        means = [x[rows].mean(axis=0) for x in (now, before, after)]
+        ripple, *others = (x[rows] - m for x, m in zip((now, before, after), means, strict=True))
+        size, moved = (np.linalg.norm(x, axis=0) for x in others)
+        growth = np.where(size > 0.0, moved / np.where(size > 0.0, size, 1.0) - 1.0, 0.0)
+        changes.append(means[2] - means[1] + growth * ripple)
+    return np.concatenate(changes)
 
 
 def columns(
     config: TuneConfig,
     robot: Robot,
     command: Command,
-    weights: Weights,
+    log: Log,
     moved: Mapping[str, tuple[float, Log, Log]],
-) -> Float[np.ndarray, "rows n"] | float:
+) -> Float[np.ndarray, "rows n"]:
     """Return the columns of numbers by their walks in a case, and zeros for all other coordinates.
 
     Args:
-        config, robot, command, weights: of the case.
+        config, robot, command: of the case.
+        log: at which the derivative is wanted.
         moved: step, log before and log after it, by name of the number.
     """
-    names, found = step_names(weights, config.others), []
-    for step, *logs in moved.values():
-        before, after = (residual_rows(config, robot, command, log) for log in logs)
-        found.append((after - before) / step)
-    if not found:
-        return 0.0
-    J = np.zeros((len(found[0]), len(names)))
-    J[:, [names.index(name) for name in moved]] = np.stack(found, axis=1)
+    of_log = partial(residuals_of, config, robot, command)
+    span, now = round(SPAN / float(log.period)), of_log(log)
+    names = [name_of(x) for x in config.others]
+    J = np.zeros((sum(x.size for x in now), len(direction_names(nominal(robot))) + len(names)))
+    for name, (step, *logs) in moved.items():
+        parts = zip(now, *map(of_log, logs), strict=True)
+        changes = np.concatenate([changed_by(*terms, span).ravel() for terms in parts])
+        J[:, names.index(name) - len(names)] = changes / step
     return J

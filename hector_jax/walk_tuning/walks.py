@@ -35,7 +35,6 @@ from hector_jax.control.weights import Weights
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.console import bar, say
 from hector_jax.core.environment import code_hash
-from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.journal import continue_journal, write_rows
 from hector_jax.core.trajectory import no_samples
@@ -56,7 +55,6 @@ from hector_jax.walk_tuning.campaign import Campaign
 from hector_jax.walk_tuning.moved import STEP, Moved, columns, numbers_by_walks
 
 RECORD = "walks.jsonl"
-START_PLANTS = 3  # on which several starts walk
 _FALL = 1.0  # log L of a fall above the largest of the start
 
 
@@ -154,8 +152,9 @@ def _slope(
         except InputError as error:
             return error
     grounding = fit_grounding(config.rollout, scenario, weights, walk, called=called)
-    J = columns(config, robot, scenario.command, weights, moved)
-    options = {"walk": grounded_rollout, "others": config.others, "columns": J}
+    options: dict[str, Any] = {"walk": grounded_rollout, "others": config.others}
+    if numbers_by_walks(config.others):
+        options["columns"] = columns(config, robot, scenario.command, log, moved)
     found = least_squares_jit(config.rollout, grounding, weights, config.loss, **options)
     return jax.device_get(found)
 
@@ -165,45 +164,10 @@ def first_slope(campaign: Campaign) -> None:
     _slope(campaign, campaign.start, 0, walk_case(campaign, campaign.start, 0).log, {})
 
 
-# The choice of the start
-
-
-def with_best_start(
-    pool: Executor, campaign: Campaign, starts: Mapping[str, Weights]
-) -> tuple[str, Campaign]:
-    """Return the name of that of several starts which walks best, and the campaign from it.
-
-    Each walks on the first plants; of those that fall least often it is that with the least mean of
-    log L, a fall bounded as in the tuning. Its walks are not made again.
-
-    Args:
-        pool, campaign: as for `tune_on_walks`; its own start does not matter.
-        starts: weights by name.
-    """
-    tried, rows, few = [], [], campaign.plants[:START_PLANTS]
-    with bar("walking with each set that the tuning on walks may begin with") as report_progress:
-        for name, start in starts.items():
-            report_progress(len(tried), len(starts), name)
-            folder = campaign.folder / "starts" / name
-            one = replace(campaign, folder=folder, start=start, plants=few)
-            continue_journal(folder / RECORD, _head(one), "walks of a start", dict, _remedy(one))
-            save_weights(weights_path(folder, 0), one.start)
-            rows.append([walked.loss for walked in walk_all(pool, one, 0, one.start)])
-            tried.append(one)
-    losses = np.array(rows)
-    means = _bounded_logs(losses, losses).mean(axis=1)
-    best = tried[np.lexsort((means, (~np.isfinite(losses)).sum(axis=1)))[0]]
-    name = best.folder.name
-    say(f"it begins with `{name}`")
-    for path, kept in zip(log_paths(best, 0), log_paths(campaign, 0), strict=False):
-        write_file(kept, path.read_bytes())
-    return name, replace(campaign, start=best.start)
-
-
 # The objective
 
 
-def _bounded_logs(
+def bounded_logs(
     losses: Float[np.ndarray, "*cases"], known: Float[np.ndarray, "*others"]
 ) -> Float[np.ndarray, "*cases"]:
     """Return log L, that of a fall and of what is worse a bound above the largest known one."""
@@ -257,7 +221,7 @@ class _Walks:
         losses = np.array([walked.loss for walked in logs])
         stood = np.isfinite(losses)
         self.losses.append(losses)
-        value = float(np.exp(_bounded_logs(losses, self.losses[0]).mean()))
+        value = float(np.exp(bounded_logs(losses, self.losses[0]).mean()))
         refused = stood.sum() < np.isfinite(self.losses[0]).sum()
         on = [] if refused else np.flatnonzero(stood).tolist()  # a slope takes as long as a walk
         some = [logs[case].log for case in on]
@@ -331,8 +295,8 @@ def tune_on_walks(
     Raises:
         InputError: the folder holds the record of another campaign, or a damaged one.
     """
-    head = _head(campaign)
-    continue_journal(campaign.folder / RECORD, head, "a tuning on walks", dict, _remedy(campaign))
+    head = record_head(campaign)
+    continue_journal(campaign.folder / RECORD, head, "a tuning on walks", dict, remedy(campaign))
     config, cases = campaign.config, len(campaign.cases)
     if walks is not None:
         config = replace(config, iterations=max(walks // cases - 1, 1))
@@ -369,13 +333,13 @@ def tune_on_walks(
     return WalkTuning(sets, None, tuning.reason)
 
 
-def _remedy(campaign: Campaign) -> str:
+def remedy(campaign: Campaign) -> str:
     """Return what to do with a folder of another campaign."""
     anew = f" and begin anew with hector propose --start {campaign.folder}/weights/N.json"
     return f"choose another folder{anew * campaign.by_logs}"
 
 
-def _head(campaign: Campaign) -> dict[str, Any]:
+def record_head(campaign: Campaign) -> dict[str, Any]:
     """Return what identifies a campaign, as JSON values."""
     head: dict[str, Any] = {
         "format": 4,
