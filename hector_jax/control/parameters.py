@@ -173,10 +173,10 @@ def own_names(weights: Weights) -> list[str]:
 def nudged(weights: Weights, other: Other, size: float) -> tuple[Weights, float]:
     """Return weights with one number moved by a step within its box, and that step.
 
-    The step is of this size if there is room on one side, see `stepped`.
+    The step is of this size, the other way if there is no room, see `stepped`.
     """
     low, high = (float(edge[-1]) for edge in step_bounds(weights, [other]))
-    step = min(size, high) if high >= min(size, -low) else -min(size, -low)
+    step = max((float(np.clip(x, low, high)) for x in (size, -size)), key=abs)
     steps = np.append(np.zeros(len(direction_names(weights))), step)
     return jax.tree.map(np.asarray, stepped(weights, steps, [other])), step
 

@@ -8,7 +8,6 @@ changes little from set to set: later ones move the number whose walks are the o
 
 from collections.abc import Iterable, Mapping
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,16 +22,8 @@ from hector_jax.own.walk_log import Log, trajectory_of
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.difftune import TuneConfig
 
-STEP = 0.1  # of a number, see `parameters.stepped`
+STEP = 0.05  # of a number, see `parameters.stepped`; back in every second case
 SPAN = 0.5  # [s] of which the mean of a residual changes as it is: about a gait cycle
-
-
-class Moved(NamedTuple):
-    """Walks of a set before and after one number was moved, by case."""
-
-    step: float
-    before: Mapping[int, Log]
-    after: Mapping[int, Log]
 
 
 def numbers_by_walks(others: Iterable[Other]) -> list[Tunable]:

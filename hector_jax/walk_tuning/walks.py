@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import replace
 from functools import partial
-from itertools import repeat
+from itertools import product, repeat
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,7 +52,7 @@ from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
 from hector_jax.tuning.rollout import Scenario
 from hector_jax.tuning.status import StepStatus
 from hector_jax.walk_tuning.campaign import Campaign
-from hector_jax.walk_tuning.moved import STEP, Moved, columns, numbers_by_walks
+from hector_jax.walk_tuning.moved import STEP, columns, numbers_by_walks
 
 RECORD = "walks.jsonl"
 _FALL = 1.0  # log L of a fall above the largest of the start
@@ -185,7 +185,8 @@ class _Walks:
         self.losses: list[np.ndarray] = []
         self.left = np.inf if walks is None else walks
         self.state: TuneState | None = None
-        self.moved: dict[str, Moved] = {}  # the latest walks of each number, the oldest first
+        # step, log before and log after it by case, of each number, the oldest first
+        self.moved: dict[str, dict[int, tuple[float, Log, Log]]] = {}
 
     def place(self, state: TuneState) -> TuneState:
         """Return the state at the set that has walked, should the code place it elsewhere.
@@ -227,10 +228,7 @@ class _Walks:
         some = [logs[case].log for case in on]
         if on and self._gains(weights, value):
             self._move(weights, dict(zip(on, some, strict=True)))
-        moved = [
-            {n: (x.step, x.before[c], x.after[c]) for n, x in self.moved.items() if c in x.after}
-            for c in on
-        ]
+        moved = [{n: x[c] for n, x in self.moved.items() if c in x} for c in on]
         found = list(self.pool.map(_slope, repeat(campaign), repeat(weights), on, some, moved))
         errors = [x for x in found if isinstance(x, InputError)]
         if errors and len(errors) == len(found) and not number:
@@ -268,13 +266,20 @@ class _Walks:
         if self.left < len(due) * len(stood) + len(campaign.cases):
             return
         self.left -= len(due) * len(stood)
-        nudges = {name: parameters.nudged(weights, numbers[name], STEP) for name in due}
-        sets = {f"{number}-{name}": moved for name, (moved, _) in nudges.items()}
-        found = walk_sets(self.pool, campaign, sets, list(stood))
-        for name, walked in zip(due, found.values(), strict=True):
-            after = {case: x.log for case, x in walked.items() if np.isfinite(x.loss)}
+        ahead = {c: (c + c // len(campaign.commands)) % 2 == 0 for c in stood}
+        nudges = {
+            (name, c): parameters.nudged(weights, numbers[name], STEP if ahead[c] else -STEP)
+            for name, c in product(due, stood)
+        }
+        sets = {(f"{number}-{name}", case): x for (name, case), (x, _) in nudges.items()}
+        found = walk_sets(self.pool, campaign, sets)
+        for name in due:
             self.moved.pop(name, None)
-            self.moved[name] = Moved(nudges[name][1], stood, after)
+            self.moved[name] = {
+                case: (nudges[name, case][1], log, after.log)
+                for case, log in stood.items()
+                if np.isfinite((after := found[f"{number}-{name}", case]).loss)
+            }
 
 
 def tune_on_walks(
@@ -361,26 +366,25 @@ def record_head(campaign: Campaign) -> dict[str, Any]:
 
 
 def walk_sets(
-    pool: Executor, campaign: Campaign, sets: Mapping[str, Weights], cases: Sequence[int]
-) -> dict[str, dict[int, ScoredLog]]:
-    """Walk sets by name in some cases, and keep each walk in the folder as it ends."""
+    pool: Executor, campaign: Campaign, sets: Mapping[tuple[str, int], Weights]
+) -> dict[tuple[str, int], ScoredLog]:
+    """Walk sets, by name and case, and keep each walk in the folder as it ends."""
     robot = campaign.robot
     like = ScoredLog(0.0, log_of(no_samples(len(robot.joint_lower), len(robot.foot_point))))
-    paths = {(n, case): log_paths(campaign, n)[case] for n in sets for case in cases}
+    paths = {(name, case): log_paths(campaign, name)[case] for name, case in sets}
     missing = [at for at, path in paths.items() if not path.exists()]
-    running = {pool.submit(walk_case, campaign, sets[n], case): (n, case) for n, case in missing}
+    running = {pool.submit(walk_case, campaign, sets[at], at[1]): at for at in missing}
     for job in as_completed(running):
         save_tree(paths[running[job]], job.result(), kind="log", robot=robot)
-    logs = {at: load_tree(x, like, kind="log", robot=robot)[0] for at, x in paths.items()}
-    return {name: {case: logs[name, case] for case in cases} for name in sets}
+    return {at: load_tree(x, like, kind="log", robot=robot)[0] for at, x in paths.items()}
 
 
 def walk_all(
     pool: Executor, campaign: Campaign, number: int, weights: Weights
 ) -> Sequence[ScoredLog]:
     """Walk a set in all cases."""
-    found = walk_sets(pool, campaign, {str(number): weights}, range(len(campaign.cases)))
-    return list(found[str(number)].values())
+    cases = range(len(campaign.cases))
+    return list(walk_sets(pool, campaign, {(str(number), c): weights for c in cases}).values())
 
 
 def weights_path(folder: Path, number: int) -> Path:
