@@ -152,7 +152,7 @@ def toy_loss(weights, case):
     return (case + 1) * 1e6 * (0.01 + off @ off)
 
 
-def toy_slope(campaign, weights, case, log):
+def toy_slope(campaign, weights, case, log, moved=None):
     """Slope and matrix of the loss of a case, in the place of those grounded on its walk."""
     gradient = 2e6 * (case + 1) * away(weights, case) / np.asarray(weights_to_vector(weights))
     loss, zero = np.asarray(toy_loss(weights, case)), np.zeros(())
@@ -351,7 +351,7 @@ def test_a_walk_whose_planner_fails_has_no_slope_and_the_others_steer(toy, monke
     """From the start on there has to be one; later a set without any is refused."""
     failing, error = {1}, InputError("plans.py: ended with code 1")
 
-    def slope(campaign, weights, case, log):
+    def slope(campaign, weights, case, log, moved):
         return error if case in failing else toy_slope(campaign, weights, case, log)
 
     monkeypatch.setattr(walks, "_slope", slope)

@@ -131,7 +131,7 @@ def _slope(
     weights: Weights,
     case: int,
     log: Log,
-    moved: Mapping[str, tuple[float, Log, Log]],
+    moved: Mapping[str, tuple[float, Log, Log]] = {},  # noqa: B006
 ) -> tuple[Evaluation, Float[np.ndarray, "n n"]] | InputError:
     """Return loss, gradient and matrix of the plain rigid body grounded on a walk.
 
@@ -161,7 +161,7 @@ def _slope(
 
 def first_slope(campaign: Campaign) -> None:
     """Compile the programs of the tuning, of which this walk is none, into the cache."""
-    _slope(campaign, campaign.start, 0, walk_case(campaign, campaign.start, 0).log, {})
+    _slope(campaign, campaign.start, 0, walk_case(campaign, campaign.start, 0).log)
 
 
 # The objective
