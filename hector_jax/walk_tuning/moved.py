@@ -3,11 +3,12 @@
 No plan has them. So a set that is accepted walks again on the same plants with one of them moved;
 the change of the residuals from walk to walk (`changed_by`), divided by the step, is a column of
 the derivative that `curvature.least_squares` takes. In the first set all are moved. A column
-changes little from set to set: later ones move the number whose walks are the oldest.
+changes little from set to set: later ones move one number, by age and curvature of its column.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,12 +24,43 @@ from hector_jax.robot.model import Robot
 from hector_jax.tuning.difftune import TuneConfig
 
 STEP = 0.05  # of a number, see `parameters.stepped`; back in every second case
-SPAN = 0.5  # [s] of which the mean of a residual changes as it is: about a gait cycle
+SPAN = 1.0  # [s] of which the mean of a residual changes as it is: some gait cycles
+
+
+class Moved(NamedTuple):
+    """Walks of a case before and after a number was moved."""
+
+    step: float
+    before: Log
+    after: Log
 
 
 def numbers_by_walks(others: Iterable[Other]) -> list[Tunable]:
     """Return the numbers of a tuning whose slopes are by walks."""
     return [x for x in others if isinstance(x, Tunable) and x.of_legs]
+
+
+class MovedWalks:
+    """The latest walks with each number moved that stood."""
+
+    def __init__(self, others: Sequence[Other]) -> None:
+        self.names, self.numbers = list(map(name_of, others)), numbers_by_walks(others)
+        self.sets: dict[str, int] = {}  # that walked last, by number
+        self.walks: dict[tuple[str, int], Moved] = {}  # by number and case
+        self.curvature = np.zeros(0)  # diagonal of the latest matrix
+
+    def due(self, at: int) -> list[Tunable]:
+        """Return the numbers to move in a set: all, later the one of most age times curvature."""
+
+        def urgency(of: Tunable) -> float:
+            place = self.names.index(of.name) - len(self.names)
+            return (at - self.sets[of.name]) * float(self.curvature[place])
+
+        return [max(self.numbers, key=urgency)] if self.numbers and self.sets else self.numbers
+
+    def of_case(self, case: int) -> dict[str, Moved]:
+        """Return the walks of a case by number."""
+        return {name: walk for (name, at), walk in self.walks.items() if at == case}
 
 
 def walks_needed(cases: int, numbers: int) -> tuple[int, int]:
@@ -80,14 +112,14 @@ def columns(
     robot: Robot,
     command: Command,
     log: Log,
-    moved: Mapping[str, tuple[float, Log, Log]],
+    moved: Mapping[str, Moved],
 ) -> Float[np.ndarray, "rows n"]:
     """Return the columns of numbers by their walks in a case, and zeros for all other coordinates.
 
     Args:
         config, robot, command: of the case.
         log: at which the derivative is wanted.
-        moved: step, log before and log after it, by name of the number.
+        moved: by name of the number.
     """
     of_log = partial(residuals_of, config, robot, command)
     span, now = round(SPAN / float(log.period)), of_log(log)

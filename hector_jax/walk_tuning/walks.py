@@ -52,7 +52,7 @@ from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
 from hector_jax.tuning.rollout import Scenario
 from hector_jax.tuning.status import StepStatus
 from hector_jax.walk_tuning.campaign import Campaign
-from hector_jax.walk_tuning.moved import STEP, columns, numbers_by_walks
+from hector_jax.walk_tuning.moved import STEP, Moved, MovedWalks, columns, numbers_by_walks
 
 RECORD = "walks.jsonl"
 _FALL = 1.0  # log L of a fall above the largest of the start
@@ -131,7 +131,7 @@ def _slope(
     weights: Weights,
     case: int,
     log: Log,
-    moved: Mapping[str, tuple[float, Log, Log]] = {},  # noqa: B006
+    moved: Mapping[str, Moved] = {},
 ) -> tuple[Evaluation, Float[np.ndarray, "n n"]] | InputError:
     """Return loss, gradient and matrix of the plain rigid body grounded on a walk.
 
@@ -185,8 +185,7 @@ class _Walks:
         self.losses: list[np.ndarray] = []
         self.left = np.inf if walks is None else walks
         self.state: TuneState | None = None
-        # step, log before and log after it by case, of each number, the oldest first
-        self.moved: dict[str, dict[int, tuple[float, Log, Log]]] = {}
+        self.moved = MovedWalks(campaign.config.others)
 
     def place(self, state: TuneState) -> TuneState:
         """Return the state at the set that has walked, should the code place it elsewhere.
@@ -228,7 +227,7 @@ class _Walks:
         some = [logs[case].log for case in on]
         if on and self._gains(weights, value):
             self._move(weights, dict(zip(on, some, strict=True)))
-        moved = [{n: x[c] for n, x in self.moved.items() if c in x} for c in on]
+        moved = [self.moved.of_case(case) for case in on]
         found = list(self.pool.map(_slope, repeat(campaign), repeat(weights), on, some, moved))
         errors = [x for x in found if isinstance(x, InputError)]
         if errors and len(errors) == len(found) and not number:
@@ -248,6 +247,7 @@ class _Walks:
         if usable:
             gradient, matrix = mean([(found.gradient, curved) for found, curved in usable])
             residual = np.max([found.residual for found, _ in usable])
+            self.moved.curvature = np.diag(matrix)
         return Evaluation(np.asarray(value), {}, gradient, fallen, np.asarray(residual)), matrix
 
     def _gains(self, weights: Weights, value: float) -> bool:
@@ -261,25 +261,21 @@ class _Walks:
     def _move(self, weights: Weights, stood: Mapping[int, Log]) -> None:
         """Walk a set again with numbers moved, unless no walks are left for a set after that."""
         campaign, number = self.campaign, len(self.losses) - 1
-        numbers = {of.name: of for of in numbers_by_walks(campaign.config.others)}
-        due = list(self.moved)[:1] or list(numbers)
+        due = self.moved.due(number)
         if self.left < len(due) * len(stood) + len(campaign.cases):
             return
         self.left -= len(due) * len(stood)
-        ahead = {c: (c + c // len(campaign.commands)) % 2 == 0 for c in stood}
+        back = {c for c in stood if (c + c // len(campaign.commands)) % 2}
         nudges = {
-            (name, c): parameters.nudged(weights, numbers[name], STEP if ahead[c] else -STEP)
-            for name, c in product(due, stood)
+            (of.name, case): parameters.nudged(weights, of, -STEP if case in back else STEP)
+            for of, case in product(due, stood)
         }
         sets = {(f"{number}-{name}", case): x for (name, case), (x, _) in nudges.items()}
-        found = walk_sets(self.pool, campaign, sets)
-        for name in due:
-            self.moved.pop(name, None)
-            self.moved[name] = {
-                case: (nudges[name, case][1], log, after.log)
-                for case, log in stood.items()
-                if np.isfinite((after := found[f"{number}-{name}", case]).loss)
-            }
+        found = walk_sets(self.pool, campaign, sets).values()
+        for ((name, case), (_, step)), walked in zip(nudges.items(), found, strict=True):
+            self.moved.sets[name] = number
+            if np.isfinite(walked.loss):
+                self.moved.walks[name, case] = Moved(step, stood[case], walked.log)
 
 
 def tune_on_walks(
