@@ -222,10 +222,14 @@ class _Walks:
         stood = np.isfinite(losses)
         self.losses.append(losses)
         value = float(np.exp(bounded_logs(losses, self.losses[0]).mean()))
-        refused = stood.sum() < np.isfinite(self.losses[0]).sum()
-        on = [] if refused else np.flatnonzero(stood).tolist()  # a slope takes as long as a walk
+        gains, refused = (
+            self._gains(weights, value),
+            stood.sum() < np.isfinite(self.losses[0]).sum(),
+        )
+        # a slope takes as long as a walk
+        on = np.flatnonzero(stood).tolist() if gains and not refused else []
         some = [logs[case].log for case in on]
-        if on and self._gains(weights, value):
+        if on:
             self._move(weights, dict(zip(on, some, strict=True)))
         moved = [self.moved.of_case(case) for case in on]
         found = list(self.pool.map(_slope, repeat(campaign), repeat(weights), on, some, moved))
@@ -243,7 +247,7 @@ class _Walks:
 
         numbers = len(parameters.step_names(weights, campaign.config.others))
         gradient, matrix = jax.tree.map(np.zeros_like, weights), np.zeros((numbers, numbers))
-        residual, fallen = np.zeros(()), np.asarray(float(not usable))
+        residual, fallen = np.zeros(()), np.asarray(float(gains and not usable))
         if usable:
             gradient, matrix = mean([(found.gradient, curved) for found, curved in usable])
             residual = np.max([found.residual for found, _ in usable])
@@ -251,7 +255,7 @@ class _Walks:
         return Evaluation(np.asarray(value), {}, gradient, fallen, np.asarray(residual)), matrix
 
     def _gains(self, weights: Weights, value: float) -> bool:
-        """Return whether a set that stood is accepted."""
+        """Return whether a set is accepted if it falls no more often than the start."""
         zero = np.zeros(())
         found = Evaluation(np.asarray(value), {}, jax.tree.map(np.zeros_like, weights), zero, zero)
         assert self.state is not None  # it was placed
