@@ -120,7 +120,18 @@ def test_commands_of_a_page_parse_and_what_it_names_is_there(path, capsys):
 PACKAGE = ROOT / "hector_jax"
 FOREIGN = {"help", "help-all", "no-NAME", "tyro-print-completion"}
 FOREIGN |= {"nworkers", "nthreads", "inplace", "xla"}
-TABLES = {"feet", "joints", "limits", "loss", "plants", "slip", "tuning", "twin", "weights"}
+TABLES = {
+    "feet",
+    "joints",
+    "limits",
+    "loss",
+    "numbers",
+    "plants",
+    "slip",
+    "tuning",
+    "twin",
+    "weights",
+}
 TABLES |= {"footstep", "gait", "legs", "mpc"}  # of a robot's file
 MEANS = {"footstep": "FootstepConfig", "gait": "GaitConfig", "legs": "LegConfig"}
 MEANS |= {"mpc": "MpcConfig", "slip": "SlipConfig", "tuning": "TuningSettings"}

@@ -107,7 +107,7 @@ def changed_by(
     return np.concatenate(changes)
 
 
-def columns(
+def columns_by_walks(
     config: TuneConfig,
     robot: Robot,
     command: Command,

@@ -52,7 +52,7 @@ from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
 from hector_jax.tuning.rollout import Scenario
 from hector_jax.tuning.status import StepStatus
 from hector_jax.walk_tuning.campaign import Campaign
-from hector_jax.walk_tuning.moved import STEP, Moved, MovedWalks, columns, numbers_by_walks
+from hector_jax.walk_tuning.moved import STEP, Moved, MovedWalks, columns_by_walks, numbers_by_walks
 
 RECORD = "walks.jsonl"
 _FALL = 1.0  # log L of a fall above the largest of the start
@@ -135,8 +135,8 @@ def _slope(
 ) -> tuple[Evaluation, Float[np.ndarray, "n n"]] | InputError:
     """Return loss, gradient and matrix of the plain rigid body grounded on a walk.
 
-    By the numbers that were `moved` they are by walks, see `moved.columns`. If the planner of the
-    user gives no plans of it this returns its error: others may go on.
+    By the numbers that were `moved` they are by walks, see `columns_by_walks`. If the planner of
+    the user gives no plans of it this returns its error: others may go on.
     """
     config, robot = campaign.config, campaign.robot
     effect = network.effect_of(None, config.rollout.walk)
@@ -154,7 +154,7 @@ def _slope(
     grounding = fit_grounding(config.rollout, scenario, weights, walk, called=called)
     options: dict[str, Any] = {"walk": grounded_rollout, "others": config.others}
     if numbers_by_walks(config.others):
-        options["columns"] = columns(config, robot, scenario.command, log, moved)
+        options["columns"] = columns_by_walks(config, robot, scenario.command, log, moved)
     found = least_squares_jit(config.rollout, grounding, weights, config.loss, **options)
     return jax.device_get(found)
 
@@ -258,7 +258,8 @@ class _Walks:
         """Return whether a set is accepted if it falls no more often than the start."""
         zero = np.zeros(())
         found = Evaluation(np.asarray(value), {}, jax.tree.map(np.zeros_like, weights), zero, zero)
-        assert self.state is not None  # it was placed
+        if self.state is None:  # nothing to compare with
+            return True
         status = difftune.trial_status(self.campaign.config, self.state, found)
         return int(status) == StepStatus.ACCEPTED
 
