@@ -585,6 +585,14 @@ def other_pages():
     text = "from {:.1f} to {:.1f} cm on straight, {:.1f} to {:.1f} on s, {:.1f} to {:.1f} on "
     text += "sideways and {:.1f} to {:.1f} on turn"
     yield DOCS / "howto" / "own.md", text.format(*cells)
+    found, cells = report("own_numbers.json"), []
+    for of in found["trajectories"].values():
+        cells.append(-of["best"]["change"]["start"]["median"])
+        assert of["best"]["falls"] == of["start"]["falls"] == 0
+    text = "took L down by {:.0f} % on straight and {:.0f} % on s on 16".format(*cells)
+    yield DOCS / "howto" / "own.md", text
+    plane = (100 * np.hypot(*of[name]["rms"]["position"][:2]) for name in ("start", "best"))
+    yield DOCS / "howto" / "own.md", "s went from {:.1f} to {:.1f} cm".format(*plane)
     notes, walks = ROOT / "experiments" / "notes.md", report("many-plants/walks.json")["L"]
     best_of_then, searched = (np.array([*walks[name].values()]) for name in ("best", "search"))
     lower = -100 * np.expm1(np.log(searched / best_of_then).mean(axis=1))

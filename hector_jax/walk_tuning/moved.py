@@ -126,7 +126,7 @@ def columns_by_walks(
     names = [name_of(x) for x in config.others]
     J = np.zeros((sum(x.size for x in now), len(direction_names(nominal(robot))) + len(names)))
     for name, (step, *logs) in moved.items():
-        parts = zip(now, *map(of_log, logs), strict=True)
-        changes = np.concatenate([changed_by(*terms, span).ravel() for terms in parts])
-        J[:, names.index(name) - len(names)] = changes / step
+        terms = zip(now, *map(of_log, logs), strict=True)
+        changes = [changed_by(at, before, after, span).ravel() for at, before, after in terms]
+        J[:, names.index(name) - len(names)] = np.concatenate(changes) / step
     return J
