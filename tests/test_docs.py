@@ -593,6 +593,9 @@ def other_pages():
     yield DOCS / "howto" / "own.md", text
     plane = (100 * np.hypot(*of[name]["rms"]["position"][:2]) for name in ("start", "best"))
     yield DOCS / "howto" / "own.md", "s went from {:.1f} to {:.1f} cm".format(*plane)
+    of_two = found["with --walk-plants 2"]["trajectories"]
+    assert {name: of["best"]["falls"] for name, of in of_two.items()} == {"straight": 0, "s": 3}
+    yield DOCS / "howto" / "own.md", "With `--walk-plants 2` three fell on s."
     notes, walks = ROOT / "experiments" / "notes.md", report("many-plants/walks.json")["L"]
     best_of_then, searched = (np.array([*walks[name].values()]) for name in ("best", "search"))
     lower = -100 * np.expm1(np.log(searched / best_of_then).mean(axis=1))
