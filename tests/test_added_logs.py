@@ -40,7 +40,7 @@ DOWN = np.r_[0.5 * np.ones(12) / np.sqrt(12.0), np.zeros(12)]  # half an e-fold,
 LENGTH = {"slope": 100.0}  # [e-folds] from nominal, where the slope ends
 
 
-def slope_of(campaign, weights, case, log):
+def slope_of(campaign, weights, case, log, moved):
     """A slope that is the same up to some distance from the start, and then none."""
     vector = np.asarray(weights_to_vector(weights))
     goes_on = np.linalg.norm(np.log(vector / NOMINAL)) < LENGTH["slope"]

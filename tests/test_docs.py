@@ -32,7 +32,7 @@ from hector_jax.core.tree_file import tree_hash
 from hector_jax.sim.margin import delay_lines
 from hector_jax.store.nets import CollectConfig
 from hector_jax.walk_tuning import best_set
-from hector_jax.walk_tuning.walks import START_PLANTS
+from hector_jax.walk_tuning.starts import START_PLANTS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -113,7 +113,18 @@ def test_commands_of_a_page_parse_and_what_it_names_is_there(path, capsys):
 PACKAGE = ROOT / "hector_jax"
 FOREIGN = {"help", "help-all", "no-NAME", "tyro-print-completion"}
 FOREIGN |= {"nworkers", "nthreads", "inplace", "xla"}
-TABLES = {"feet", "joints", "limits", "loss", "plants", "slip", "tuning", "twin", "weights"}
+TABLES = {
+    "feet",
+    "joints",
+    "limits",
+    "loss",
+    "numbers",
+    "plants",
+    "slip",
+    "tuning",
+    "twin",
+    "weights",
+}
 TABLES |= {"footstep", "gait", "legs", "mpc"}  # of a robot's file
 MEANS = {"footstep": "FootstepConfig", "gait": "GaitConfig", "legs": "LegConfig"}
 MEANS |= {"mpc": "MpcConfig", "slip": "SlipConfig", "tuning": "TuningSettings"}
@@ -551,6 +562,17 @@ def other_pages():
     text = "from {:.1f} to {:.1f} cm on straight, {:.1f} to {:.1f} on s, {:.1f} to {:.1f} on "
     text += "sideways and {:.1f} to {:.1f} on turn"
     yield DOCS / "howto" / "own.md", text.format(*cells)
+    found, cells = report("own_numbers.json"), []
+    for of in found["trajectories"].values():
+        cells.append(-of["best"]["change"]["start"]["median"])
+        assert of["best"]["falls"] == of["start"]["falls"] == 0
+    text = "took L down by {:.0f} % on straight and {:.0f} % on s on 16".format(*cells)
+    yield DOCS / "howto" / "own.md", text
+    plane = (100 * np.hypot(*of[name]["rms"]["position"][:2]) for name in ("start", "best"))
+    yield DOCS / "howto" / "own.md", "s went from {:.1f} to {:.1f} cm".format(*plane)
+    of_two = found["with --walk-plants 2"]["trajectories"]
+    assert {name: of["best"]["falls"] for name, of in of_two.items()} == {"straight": 0, "s": 3}
+    yield DOCS / "howto" / "own.md", "With `--walk-plants 2` three fell on s."
     notes, walks = ROOT / "experiments" / "notes.md", report("many-plants/walks.json")["L"]
     best_of_then, searched = (np.array([*walks[name].values()]) for name in ("best", "search"))
     lower = -100 * np.expm1(np.log(searched / best_of_then).mean(axis=1))

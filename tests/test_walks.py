@@ -31,6 +31,7 @@ from hector_jax.tuning.loss import alphas, loss_of
 from hector_jax.walk_tuning import added_logs, best_set, walks
 from hector_jax.walk_tuning import campaign as campaigns
 from hector_jax.walk_tuning.best_set import drawn_plants
+from hector_jax.walk_tuning.starts import with_best_start
 
 # all walks of this file are of these ticks and this command: one set of programs for all tests
 CONFIG, COMMAND, SECONDS = TuneConfig(rollout=BRIEF, least_gain=1e-6), {"short": AHEAD}, 0.05
@@ -133,7 +134,7 @@ def toy_loss(weights, case):
     return (case + 1) * 1e6 * (0.01 + off @ off)
 
 
-def toy_slope(campaign, weights, case, log):
+def toy_slope(campaign, weights, case, log, moved=None):
     """Slope and matrix of the loss of a case, in the place of those grounded on its walk."""
     gradient = 2e6 * (case + 1) * away(weights, case) / np.asarray(weights_to_vector(weights))
     loss, zero = np.asarray(toy_loss(weights, case)), np.zeros(())
@@ -194,14 +195,14 @@ def test_a_tuning_begins_with_the_start_that_walks_best_and_repeats_none_of_its_
     aim = np.asarray(directions().T) @ np.linspace(-0.4, 0.2, 18)
     near, far = (as_weights(np.exp(x * aim) * NOMINAL) for x in (0.9, -2.0))
     starts = {"far": far, "near": near, "nominal": nominal()}
-    name, first = walks.with_best_start(HERE, toy(cases=5), starts)
+    name, first = with_best_start(HERE, toy(cases=5), starts)
     assert name == "near"
     assert same(first.start, walks.difftune.init(CONFIG, near).start)
     assert [case for case, _ in WALKED] == 3 * [0, 1, 2]
     found = walks.tune_on_walks(HERE, first, walks=10)
     assert [case for case, _ in WALKED[9:]] == [3, 4, 0, 1, 2, 3, 4]
     assert same(found.sets[0].weights, first.start)
-    _, again = walks.with_best_start(HERE, toy(cases=5), starts)
+    _, again = with_best_start(HERE, toy(cases=5), starts)
     assert same(again.start, first.start)
     assert len(WALKED) == 16
 
@@ -210,7 +211,7 @@ def test_of_several_starts_one_that_falls_less_often_is_taken(monkeypatch, toy):
     losses = iter([np.inf, 1e6, 1e6, 2e6, 2e6, 1.5e6])
     monkeypatch.setattr(walks, "walk_case", lambda *_: walk_log.ScoredLog(next(losses), LOG))
     starts = {"falls": expert(), "stands": nominal()}
-    name, first = walks.with_best_start(HERE, toy(), starts)
+    name, first = with_best_start(HERE, toy(), starts)
     assert name == "stands"
     assert same(first.start, walks.difftune.init(CONFIG, nominal()).start)
 
@@ -328,7 +329,7 @@ def test_a_walk_whose_planner_fails_has_no_slope_and_the_others_steer(toy, monke
     """From the start on there has to be one; later a set without any is refused."""
     failing, error = {1}, InputError("plans.py: ended with code 1")
 
-    def slope(campaign, weights, case, log):
+    def slope(campaign, weights, case, log, moved):
         return error if case in failing else toy_slope(campaign, weights, case, log)
 
     monkeypatch.setattr(walks, "_slope", slope)

@@ -23,12 +23,16 @@ FRICTION, TWIST, MOST_FORCE = 0.5, 0.03, 500.0  # M_z / F_z [m]; [N]
 TOE, HEEL = 0.09, 0.06  # [m] from the foot point
 
 STAND, IN_PLACE = 0.1, 0.4  # [s] before t = 0: on both feet, then steps without a command
-STEP = 0.2  # [s] of a stance, and of a swing
-WIDTH, FEEDBACK = 0.08, 0.12  # [m] of a foot from the middle; [s] on the error of the velocity
-APEX, LANDING = 0.08, -0.005  # [m] height of the foot point in mid-swing and at its end
-KP = np.array([60.0, 60.0, 60.0, 60.0, 20.0])  # [N m/rad] of a leg's joints, hip yaw to ankle
-KD = np.array([1.5, 1.5, 1.5, 1.5, 0.5])  # [N m s/rad]
+WIDTH, LANDING = 0.08, -0.005  # [m] of a foot from the middle; of the foot point at touchdown
+SOFTER = np.array([1.0, 1.0, 1.0, 1.0, 3.0])  # gains of a leg's joints, hip yaw to ankle, over this
 STANCE_DAMPING = 0.1  # [N m s/rad]
+NUMBERS = {  # that a tuning may change too
+    "STEP": 0.2,  # [s] of a stance, and of a swing
+    "FEEDBACK": 0.12,  # [s] of a foothold on the error of the velocity
+    "APEX": 0.08,  # [m] height of the foot point in mid-swing
+    "KP": 60.0,  # [N m/rad]
+    "KD": 1.5,  # [N m s/rad]
+}
 
 
 def skew(x: np.ndarray) -> np.ndarray:
@@ -68,13 +72,14 @@ class Controller:
     """The controller, with a model of the robot of its own; t = 0 comes STAND + IN_PLACE later."""
 
     def __init__(self, weights: Mapping[str, Mapping], command: Mapping[str, Sequence]) -> None:
-        """Take weights {"Q": .., "R": ..} and a command, whose pieces are walked periodically."""
+        """Take weights {"Q": .., "R": .., "others": ..} and a command, whose pieces repeat."""
         self.model = model = mujoco.MjModel.from_xml_path(str(MODEL))
         self.data = data = mujoco.MjData(model)
         self.sites = [model.site(f"{side}_foot_point").id for side in SIDES]
         Q, R = weights["Q"], weights["R"]
         self.Q = np.array([*np.ravel([Q[name] for name in PARTS[13]]), 0.0])
         self.R = np.concatenate([np.ravel(R[name]) for name in PARTS[6]])
+        self.numbers = NUMBERS | weights.get("others", {})
         self.command = {name: np.array(values) for name, values in command.items()}
         # the rigid body: the robot as it stands
         mujoco.mj_resetDataKeyframe(model, data, 0)
@@ -91,7 +96,7 @@ class Controller:
 
     def stands(self, time: float) -> np.ndarray:
         """Return which feet are planned to stand (2,); t = 0 is the start of the command."""
-        left = (time + IN_PLACE + 1e-9) // STEP % 2 == 0
+        left = (time + IN_PLACE + 1e-9) // self.numbers["STEP"] % 2 == 0
         return np.array([left, not left]) | (time < -IN_PLACE - 1e-9)
 
     def wanted(self, time: float) -> tuple[np.ndarray, float]:
@@ -155,31 +160,34 @@ class Controller:
             A = rows @ own
             change = np.column_stack([error, speed - rows @ J @ qvel])
             change = A.T @ np.linalg.solve(A @ A.T + 1e-4 * np.eye(5), change)  # of the joints
-            torque[leg] = KP * change[:, 0] + KD * change[:, 1] + data.qfrc_bias[6:][leg]
+            kp, kd = (self.numbers[name] / SOFTER for name in ("KP", "KD"))
+            torque[leg] = kp * change[:, 0] + kd * change[:, 1] + data.qfrc_bias[6:][leg]
         limit = model.actuator_ctrlrange[:, 1]
         return np.clip(torque, -limit, limit)
 
     def swing(self, time: float, x: np.ndarray, foot: int) -> tuple[np.ndarray, np.ndarray]:
         """Return where a foot in the air should be, and its speed: x, y, z, pitch, yaw."""
-        s, start = (time + IN_PLACE + 1e-9) % STEP / STEP, self.lift[foot]
+        step, apex = self.numbers["STEP"], self.numbers["APEX"]
+        s, start = (time + IN_PLACE + 1e-9) % step / step, self.lift[foot]
         end, yaw = self.foothold(time, x, foot)
         way = np.array([*(end - start[:3]), 0.0, wrap(yaw - start[3])])
         share, slope = smooth(s)
         target = np.array([*start[:3], 0.0, start[3]]) + share * way
-        speed = slope / STEP * way
+        speed = slope / step * way
         rise, climb = smooth(1.0 - abs(1.0 - 2.0 * s))
         floor = start[2] if s < 0.5 else LANDING
-        target[2] = floor + rise * (APEX - floor)
-        speed[2] = np.sign(0.5 - s) * 2.0 * climb / STEP * (APEX - floor)
+        target[2] = floor + rise * (apex - floor)
+        speed[2] = np.sign(0.5 - s) * 2.0 * climb / step * (apex - floor)
         return target, speed
 
     def foothold(self, time: float, x: np.ndarray, foot: int) -> tuple[np.ndarray, float]:
         """Return the next foothold of a foot (3,), and its yaw; its height does not count."""
-        travel = STEP - (time + IN_PLACE + 1e-9) % STEP + 0.5 * STEP
+        step = self.numbers["STEP"]
+        travel = step - (time + IN_PLACE + 1e-9) % step + 0.5 * step
         velocity, rate = self.wanted(time)
         yaw = x[2] + rate * travel
         end = x[3:6] + rot_z(yaw) @ [0.0, WIDTH * (1 - 2 * foot), 0.0] + x[9:12] * travel
-        return end + FEEDBACK * (x[9:12] - rot_z(x[2]) @ velocity), yaw
+        return end + self.numbers["FEEDBACK"] * (x[9:12] - rot_z(x[2]) @ velocity), yaw
 
     def plan(self, time: float, x: np.ndarray, feet: np.ndarray, yaws: np.ndarray) -> np.ndarray:
         """Solve the MPC; return force and moment of the ground on each foot now (2, 6)."""

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Mapping
 
 import numpy as np
-from controller import PARTS, Controller
+from controller import NUMBERS, PARTS, Controller
 
 
 def plans(asked: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -12,6 +12,7 @@ def plans(asked: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     names = ("duration", "velocity", "yaw_rate")
     Q = {name: asked[f"weights.Q.{name}"] for name in PARTS[13]}
     R = {name: asked[f"weights.R.{name}"] for name in PARTS[6]}
+    others = {n: asked[x] for n in NUMBERS if (x := f"weights.others.{n}") in asked}
     robot = Controller(
         {"Q": {n: x[0] for n, x in Q.items()}, "R": {n: x[0] for n, x in R.items()}},
         {name: asked[f"command.{name}"] for name in names},
@@ -22,6 +23,7 @@ def plans(asked: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     for row, time in enumerate(times):
         robot.Q[:12] = np.concatenate([x[row] for x in Q.values()])
         robot.R = np.concatenate([x[row].ravel() for x in R.values()])
+        robot.numbers |= {name: x[row] for name, x in others.items()}
         x = np.append(states[row], 1.0)
         robot.wrench[:] = np.nan  # what it would keep if it did not solve the plan
         wrenches[row] = robot.plan(time, x, feet[row], yaws[row])

@@ -23,10 +23,11 @@ from hector_jax.cli.flags import (
 from hector_jax.control import trajectories
 from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import gait_named
+from hector_jax.control.parameters import Tunable, numbers_of
 from hector_jax.control.reference import COMMANDS
 from hector_jax.control.trajectories import NamedCommand, beyond, limits
 from hector_jax.control.weights import Weights, expert, nominal
-from hector_jax.control.weights_file import best, load_weights
+from hector_jax.control.weights_file import best, load_weights, with_numbers
 from hector_jax.core.console import say
 from hector_jax.core.files import as_json
 from hector_jax.core.inputs import InputError
@@ -47,13 +48,15 @@ from hector_jax.verdict.metrics import family_of
 
 
 def weights_by_name(text: str, robot: Robot) -> Weights:
-    """Return a weight set by its name, or from a file.
+    """Return a weight set by its name, or from a file, with all of the robot's numbers.
 
     Raises:
         InputError: the file holds none.
     """
     named = {"nominal": nominal, "expert": expert, "best": best}
-    return named[text](robot) if text in named else load_weights(Path(text), robot)
+    if text in named:
+        return with_numbers(named[text](robot), robot)
+    return load_weights(Path(text), robot)
 
 
 def engine_of(args: Evaluate | Tune | Walk) -> Engine:
@@ -82,6 +85,12 @@ def planner_of(args: ByPlanner) -> Program | None:
         return None
     settings = args if isinstance(args, ByWalker) else ByWalker()
     return program_of(args.planner, settings.walker_limit, settings.walker_uses)
+
+
+def own_numbers(args: ByPlanner, robot: Robot) -> tuple[Tunable, ...]:
+    """Return the robot's numbers; without a planner all are as those of the legs, by walks."""
+    numbers = numbers_of(robot.description)
+    return numbers if args.planner else tuple(x._replace(path="legs") for x in numbers)
 
 
 def short_names(texts: Sequence[str]) -> dict[str, str]:

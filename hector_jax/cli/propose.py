@@ -24,6 +24,7 @@ from hector_jax.store import tunings
 from hector_jax.store.run import CONFIG
 from hector_jax.walk_tuning import added_logs, best_set, walks
 from hector_jax.walk_tuning.campaign import Campaign
+from hector_jax.walk_tuning.moved import numbers_by_walks
 
 
 def run_propose(args: Propose) -> None:
@@ -178,4 +179,9 @@ def _campaign(args: Propose) -> Campaign:
     if planner and config.others:
         text = "--tune must be weights beside --planner, which plans by Q and R"
         raise InputError(f"{text}, got {' '.join(args.tune)}")
+    if legs := numbers_by_walks(numbers := arguments.own_numbers(args, robot)):
+        path, names = robot.description.path, ", ".join(of.name for of in legs)
+        text = "slopes by walks, which hector tune --walker makes: leave them out here"
+        raise InputError(f"{path}: numbers: {names} need {text}")
+    config = replace(config, others=(*config.others, *numbers))
     return Campaign(args.folder, config, robot, start, commands, planner=planner)

@@ -25,6 +25,7 @@ from hector_jax.store.cache import robot_hash
 from hector_jax.store.nets import COLLECTION_CODE, load_trained
 from hector_jax.store.run import CONFIG, VERSIONS, Run, flattened
 from hector_jax.walk_tuning import best_set
+from hector_jax.walk_tuning.moved import numbers_by_walks
 
 F = TypeVar("F", bound=Flags)
 
@@ -63,8 +64,9 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
             numbers that no gradient tunes; --net is not its net.
     """
     loaded = arguments.load_trajectories(args.traj, robot)
-    best_set.walk_plants(robot, args.walk_plants, args.walks, len(loaded))
-    _check_walker(args)
+    _check_walker(args, robot)
+    by_walks = len(numbers_by_walks(arguments.own_numbers(args, robot)))
+    best_set.walk_plants(robot, args.walk_plants, args.walks, len(loaded), by_walks)
     if args.net:
         load_trained(args.net, robot, args.variant)
     arguments.engine_of(args)  # whether it is installed
@@ -75,11 +77,14 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
     return loaded
 
 
-def _check_walker(args: Tune) -> None:
+def _check_walker(args: Tune, robot: Robot) -> None:
     """Raise an InputError if the flags of a tuning do not go with a program of the user."""
     if args.walker is None:
         if args.planner:
             raise InputError("--planner plans for the walks of a --walker, which is not given")
+        if robot.description.numbers:
+            text = "[numbers] are of a controller of your own, which walks with --walker"
+            raise InputError(f"{robot.description.path}: {text}")
         return
     if not args.walks:
         raise InputError("--walker needs --walks, the number of its walks that a tuning may take")

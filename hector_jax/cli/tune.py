@@ -48,7 +48,8 @@ from hector_jax.verdict import judging, metrics
 from hector_jax.verdict.judging import Judged
 from hector_jax.walk_tuning import best_set
 from hector_jax.walk_tuning.campaign import Campaign
-from hector_jax.walk_tuning.walks import WalkTuning, first_slope, tune_on_walks, with_best_start
+from hector_jax.walk_tuning.starts import with_best_start
+from hector_jax.walk_tuning.walks import WalkTuning, first_slope, tune_on_walks
 
 _ARTEFACTS = "kept"  # folder in it
 

@@ -42,6 +42,7 @@ from hector_jax.store.setup import Setup
 from hector_jax.verdict import judging, metrics
 from hector_jax.walk_tuning import best_set
 from hector_jax.walk_tuning.campaign import Campaign
+from hector_jax.walk_tuning.moved import numbers_by_walks, walks_needed
 from hector_jax.walk_tuning.walks import tune_on_walks
 
 
@@ -148,7 +149,9 @@ def tune_walker(folder: Path, args: Tune) -> None:
     """
     robot = load_robot(args.robot)
     trajectories = run_folder.trajectories(args, robot)
-    config = arguments.with_length(tunings.tune_config(robot), trajectories[0])
+    numbers = arguments.own_numbers(args, robot)
+    config = tunings.tune_config(robot, others=numbers)
+    config = arguments.with_length(config, trajectories[0])
     seconds = config.rollout.ticks * config.rollout.walk.gait.tick
     assert args.walks is not None  # checked with the flags
     commands = {trajectory.name: trajectory.command for trajectory in trajectories}
@@ -158,11 +161,14 @@ def tune_walker(folder: Path, args: Tune) -> None:
         robot,
         arguments.weights_by_name(args.start, robot),
         commands,
-        best_set.walk_plants(robot, args.walk_plants, args.walks, len(commands))[0],
+        best_set.walk_plants(
+            robot, args.walk_plants, args.walks, len(commands), len(numbers_by_walks(numbers))
+        )[0],
         arguments.engine_of(args),
         arguments.planner_of(args),
     )
     _check_first(args, campaign, seconds)
+    _say_cost(campaign)
     with workers(args.processes, args.cluster) as pool:
         tuned = tune_on_walks(pool, campaign, walks=args.walks)
         if not tuned.sets[0].accepted:
@@ -197,6 +203,15 @@ def tune_walker(folder: Path, args: Tune) -> None:
     if means["best"] >= means["start"]:
         say("on plants that were not walked `best` is no better than the start: keep that")
     say(f"the weights are {folder / 'weights' / 'best.json'}")
+
+
+def _say_cost(campaign: Campaign) -> None:
+    """Say how many walks the numbers cost whose slopes are by walks."""
+    if numbers := numbers_by_walks(campaign.config.others):
+        first, later = walks_needed(len(campaign.cases), len(numbers))
+        names = ", ".join(of.name for of in numbers)
+        text = f"the first set takes {first} walks, each better one {later}, one that is no better"
+        say(f"the slopes by {names} are by walks: {text} {len(campaign.cases)}")
 
 
 def _check_first(args: Tune, campaign: Campaign, seconds: float) -> None:

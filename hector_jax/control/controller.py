@@ -21,7 +21,15 @@ from hector_jax.control.footstep import Feet, FootstepConfig, FootstepParameters
 from hector_jax.control.gait import PATTERNS, GaitConfig
 from hector_jax.control.legs import LegConfig, LegParameters, Measurement
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
-from hector_jax.control.parameters import COST, Parameters, tunable
+from hector_jax.control.parameters import (
+    COST,
+    Other,
+    Parameters,
+    is_ours,
+    name_of,
+    tunable,
+    without_numbers,
+)
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.slip import Grip, SlipConfig, feel, first_grip
 from hector_jax.control.twin import ReferenceInputs, TwinConfig
@@ -61,16 +69,19 @@ class WalkConfig:
         mpc = self.mpc.parameters(weights._replace(others={}))
         parameters = Parameters(mpc, self.footstep.parameters, self.legs.parameters)
         for name, value in weights.others.items():
+            if not is_ours(name):
+                text = "is a number of a controller of your own, which walks with --walker"
+                raise InputError(f"{name} {text}")
             if name.startswith(COST) and name.removeprefix(COST) not in mpc.costs:
                 costs = (f"{COST}{cost}" for cost in mpc.costs)
                 raise InputError(unknown("cost of the MPC", name, costs))
             parameters = tunable(name).write(parameters, value)
         return parameters
 
-    def with_others(self, weights: Weights, names: Iterable[str]) -> Weights:
-        """Return the weights with `others` of these names added from this config if missing."""
-        parameters = self.parameters(weights)
-        missing = [name for name in names if name not in weights.others]
+    def with_others(self, weights: Weights, others: Iterable[Other]) -> Weights:
+        """Return the weights with these numbers added from this config if missing."""
+        parameters = self.parameters(without_numbers(weights))
+        missing = [name for name in map(name_of, others) if name not in weights.others]
         added = {name: np.asarray(tunable(name).read(parameters), float) for name in missing}
         return weights._replace(others={**weights.others, **added})
 

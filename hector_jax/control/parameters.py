@@ -37,7 +37,7 @@ from hector_jax.control.weights import (
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import Range
-from hector_jax.robot.description import HECTOR
+from hector_jax.robot.description import HECTOR, Description
 from hector_jax.robot.model import Robot
 
 
@@ -50,18 +50,23 @@ class Parameters(NamedTuple):
 
 
 class Tunable(NamedTuple):
-    """An entry of `Parameters` that can be tuned, and its bounds."""
+    """An entry of `Parameters` that can be tuned, and its bounds; or another controller's number.
 
-    path: str  # for example "mpc.weights.Q"
+    A function that takes `others` takes names of `TUNABLES` and tunables of another controller.
+    """
+
+    path: str  # for example "mpc.weights.Q"; of another controller "plan" or "legs", which use it
     lower: float
     upper: float
     each_joint: bool = False  # an array with a number for each joint of a leg, else a scalar
-    cost: str = ""  # the factor on the weight of this cost of one's own, stepped in logarithms
+    cost: str = ""  # the factor on the weight of this cost of one's own
+    log: bool = False  # stepped in logarithms, else in shares of its box
+    name: str = ""  # in `Weights.others`, of another controller's
 
     @property
     def of_legs(self) -> bool:
         """True if the rigid-body model does not have it, so that no gradient tunes it."""
-        return self.path.startswith("legs.")
+        return self.path.startswith("legs")
 
     @property
     def width(self) -> float:
@@ -118,11 +123,64 @@ COST = "cost_"
 """Begins the name of the factor on the weight of a cost of one's own, which is a tunable too."""
 
 
-def tunable(name: str) -> Tunable:
+Other = str | Tunable
+"""A number beside Q and R: a name of this controller's, or what another controller's is."""
+
+
+def tunable(other: Other) -> Tunable:
     """Return the tunable of a name in `Weights.others`; KeyError if there is none."""
-    if name.startswith(COST):
-        return Tunable("mpc.costs", 1e-3, 1e3, cost=name.removeprefix(COST))
-    return TUNABLES[name]
+    if isinstance(other, Tunable):
+        return other
+    if other.startswith(COST):
+        return Tunable("mpc.costs", 1e-3, 1e3, cost=other.removeprefix(COST), log=True)
+    return TUNABLES[other]
+
+
+def name_of(other: Other) -> str:
+    """Return the name of a number in `Weights.others`."""
+    return other.name if isinstance(other, Tunable) else other
+
+
+def numbers_of(description: Description) -> tuple[Tunable, ...]:
+    """Return the tunables of another controller that a robot's TOML names in `[numbers]`.
+
+    Raises:
+        InputError: one has the name of a number of this project's controller.
+    """
+    for name, _ in description.numbers:
+        if is_ours(name):
+            text = "is a number of this project's controller: give yours another name"
+            raise InputError(f"{description.path}: numbers: {name} {text}")
+    return tuple(
+        Tunable(x.used_by, x.low, x.high, log=x.scale == "log", name=name)
+        for name, x in description.numbers
+    )
+
+
+def is_ours(name: str) -> bool:
+    """Return whether a name in `Weights.others` is of this project's controller."""
+    return name in TUNABLES or name.startswith(COST)
+
+
+def without_numbers(weights: Weights) -> Weights:
+    """Return weights without the numbers of another controller, of which this one is the twin."""
+    return weights._replace(others={n: x for n, x in weights.others.items() if is_ours(n)})
+
+
+def own_names(weights: Weights) -> list[str]:
+    """Return the names of the numbers of another controller, in order."""
+    return sorted(name for name in weights.others if not is_ours(name))
+
+
+def nudged(weights: Weights, other: Other, size: float) -> tuple[Weights, float]:
+    """Return weights with one number moved by a step within its box, and that step.
+
+    The step is of this size, the other way if there is no room, see `stepped`.
+    """
+    low, high = (float(edge[-1]) for edge in step_bounds(weights, [other]))
+    step = max((float(np.clip(x, low, high)) for x in (size, -size)), key=abs)
+    steps = np.append(np.zeros(len(direction_names(weights))), step)
+    return jax.tree.map(np.asarray, stepped(weights, steps, [other])), step
 
 
 _FOOTSTEPS = ("footstep_feedback", "turn_lead")
@@ -147,15 +205,15 @@ def tunables(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(member for name in names for member in GROUPS.get(name, (name,))))
 
 
-def out_of_box(name: str, start: Any) -> str:
+def out_of_box(other: Other, start: Any) -> str:
     """Return why a tuning of a number cannot start at a value; empty if it can."""
-    box = Range(tunable(name).lower, tunable(name).upper)
+    box = Range(tunable(other).lower, tunable(other).upper)
     if all(number in box for number in np.ravel(start).tolist()):
         return ""
-    return f"{name} starts at {start}, expected {box}"
+    return f"{name_of(other)} starts at {start}, expected {box}"
 
 
-def bounds(others: Iterable[str] = (), like: Weights | None = None) -> tuple[Weights, Weights]:
+def bounds(others: Iterable[Other] = (), like: Weights | None = None) -> tuple[Weights, Weights]:
     """Return the lower and upper bounds Theta of feasible weights and of `others`.
 
     The weights have the shapes of `like`, by default HECTOR's.
@@ -170,27 +228,27 @@ def bounds(others: Iterable[str] = (), like: Weights | None = None) -> tuple[Wei
         return Weights(
             jax.tree.map(lambda w: np.full(np.shape(w), getattr(Q, side)), like.Q),
             jax.tree.map(lambda w: np.full(np.shape(w), getattr(R, side)), like.R),
-            {name: getattr(tunable(name), side) for name in others},
+            {name_of(other): getattr(tunable(other), side) for other in others},
         )
 
     return bound("lower"), bound("upper")
 
 
-def step_names(like: Weights, others: Iterable[str] = ()) -> tuple[str, ...]:
+def step_names(like: Weights, others: Iterable[Other] = ()) -> tuple[str, ...]:
     """Return the names of the coordinates in which weights are stepped, see `stepped`."""
-    return (*direction_names(like), *others)
+    return (*direction_names(like), *map(name_of, others))
 
 
 def stepped(
-    start: Weights, steps: Float[Array | np.ndarray, " n"], others: Sequence[str] = ()
+    start: Weights, steps: Float[Array | np.ndarray, " n"], others: Sequence[Other] = ()
 ) -> Weights:
     """Return weights after steps from a start.
 
     Args:
         start: with all feet sharing one R.
         steps: log-steps in the `weights.directions`, then of each of `others`, entry by entry, as
-            shares of their boxes; log-steps of factors of costs.
-        others: names of numbers in `start.others`.
+            shares of their boxes; or log-steps, see `Tunable.log`.
+        others: numbers in `start.others`.
 
     >>> start = nominal()._replace(others={"turn_lead": 0.5})
     >>> float(stepped(start, np.full(19, 0.1), ["turn_lead"]).others["turn_lead"])
@@ -198,38 +256,40 @@ def stepped(
     """
     of_weights, rest = jnp.split(jnp.asarray(steps), [len(direction_names(start))])
     moved = dict(start.others)
-    for name in others:
+    for other in others:
+        name, of = name_of(other), tunable(other)
         part, rest = jnp.split(rest, [np.size(moved[name])])
-        part, of = part.reshape(np.shape(moved[name])), tunable(name)
+        part = part.reshape(np.shape(moved[name]))
         logs = moved[name] * jnp.exp(part)
-        moved[name] = logs if of.cost else moved[name] + part * of.width
+        moved[name] = logs if of.log else moved[name] + part * of.width
     return scale_weights(start, of_weights)._replace(others=moved)
 
 
 def steps_between(
-    start: Weights, weights: Weights, others: Sequence[str] = ()
+    start: Weights, weights: Weights, others: Sequence[Other] = ()
 ) -> Float[Array, " n"]:
     """Return the steps from a start to weights: the inverse of `stepped`."""
     first_foot = directions(start).argmax(axis=1)  # index of each direction's first weight
     logs = jnp.log(weights_to_vector(weights) / weights_to_vector(start))[first_foot]
 
-    def away_of(name: str) -> Any:
-        at, before, of = weights.others[name], start.others[name], tunable(name)
-        return jnp.log(at / before) if of.cost else (at - before) / of.width
+    def away_of(other: Other) -> Any:
+        of = tunable(other)
+        at, before = (x.others[name_of(other)] for x in (weights, start))
+        return jnp.log(at / before) if of.log else (at - before) / of.width
 
-    away = [jnp.asarray(away_of(name)) for name in others]
+    away = [jnp.asarray(away_of(other)) for other in others]
     return jnp.concatenate([logs, *map(jnp.ravel, away)])
 
 
 def step_bounds(
-    start: Weights, others: Sequence[str] = ()
+    start: Weights, others: Sequence[Other] = ()
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """Return the lower and upper bounds of the steps that stay in the box, see `stepped`."""
     lower, upper = (steps_between(start, edge, others) for edge in bounds(others, start))
     return lower, upper
 
 
-def check_in_box(start: Weights, others: Sequence[str] = ()) -> None:
+def check_in_box(start: Weights, others: Sequence[Other] = ()) -> None:
     """Raise an InputError unless a tuning can start from weights: all numbers are in their box."""
     trees = (start, *bounds(like=start))
     at, low, high = (np.asarray(weights_to_vector(w), float) for w in trees)
@@ -237,21 +297,24 @@ def check_in_box(start: Weights, others: Sequence[str] = ()) -> None:
         if not least <= value <= most:
             text = f"a tuning starts from weights of {least:g} to {most:g}"
             raise InputError(f"{name} is {value:g}; {text}")
-    for name in others:
-        if reason := out_of_box(name, start.others[name]):
+    for other in others:
+        if reason := out_of_box(other, start.others[name_of(other)]):
             raise InputError(reason)
 
 
 def weights_after(
-    start: Weights, steps: Float[Array | np.ndarray, " n"], others: Sequence[str] = ()
+    start: Weights, steps: Float[Array | np.ndarray, " n"], others: Sequence[Other] = ()
 ) -> Weights:
     """Return the weights of `stepped`, clipped to the box against rounding of the logarithm."""
-    lower, upper = bounds(start.others, start)
-    return jax.tree.map(jnp.clip, stepped(start, steps, others), lower, upper)
+    lower, upper = bounds(others, start)
+    after = stepped(start, steps, others)
+    moved = after._replace(others={name: after.others[name] for name in lower.others})
+    clipped = jax.tree.map(jnp.clip, moved, lower, upper)
+    return clipped._replace(others={**after.others, **clipped.others})
 
 
 def gradient_by_steps(
-    weights: Weights, gradient: Weights, others: Sequence[str] = ()
+    weights: Weights, gradient: Weights, others: Sequence[Other] = ()
 ) -> Float[Array, " n"]:
     """Return the gradient by the steps of `stepped` from that by the weights."""
     none = jnp.zeros_like(steps_between(weights, weights, others))
@@ -259,7 +322,7 @@ def gradient_by_steps(
 
 
 def gradient_by_weights(
-    weights: Weights, gradient: Float[Array, " n"], others: Sequence[str] = ()
+    weights: Weights, gradient: Float[Array, " n"], others: Sequence[Other] = ()
 ) -> Weights:
     """Return the gradient by the weights of which `gradient_by_steps` is this one.
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hector_jax.control.parameters import COST, TUNABLES, tunable
+from hector_jax.control.parameters import COST, TUNABLES, numbers_of, tunable
 from hector_jax.control.tagged_file import is_tagged, read_own, tagged_weights
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.files import write_json
@@ -62,7 +62,8 @@ def best(robot: Robot | None = None) -> Weights:
 def load_weights(path: Path, robot: Robot | None = None) -> Weights:
     """Read weights that `save_weights` or a person wrote, or the tagged numbers of any file.
 
-    Q and R have to be in the range `WEIGHTS`, `others` in their bounds in `TUNABLES`.
+    Q and R have to be in the range `WEIGHTS`, `others` in their bounds in `TUNABLES`, or in those
+    of the robot's numbers, which start as its description says.
 
     Args:
         path: JSON file, or one with tags (`tagged_file`).
@@ -102,11 +103,19 @@ def load_weights(path: Path, robot: Robot | None = None) -> Weights:
             name: _numbers(path, f"{part}.{name}", value, *entries[name])
             for name, value in given.items()
         }
-    return Weights(State(**values["Q"]), like.R._replace(**values["R"]), values["others"])
+    weights = Weights(State(**values["Q"]), like.R._replace(**values["R"]), values["others"])
+    return with_numbers(weights, robot) if robot else weights
+
+
+def with_numbers(weights: Weights, robot: Robot) -> Weights:
+    """Return weights with the robot's numbers that they lack, at their start."""
+    starts = {name: np.asarray(number.start) for name, number in robot.description.numbers}
+    return weights._replace(others={**starts, **weights.others})
 
 
 def _others(names: Iterable[str], robot: Robot | None) -> dict[str, tuple[tuple[int, ...], Range]]:
     numbers = {name: tunable(name) for name in names}
+    numbers |= {of.name: of for of in numbers_of(robot.description)} if robot else {}
     return {n: (x.shape(robot), Range(x.lower, x.upper)) for n, x in numbers.items()}
 
 

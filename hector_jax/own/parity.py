@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from hector_jax.control.controller import WalkConfig, contacts_needed, measured_feet, plan
 from hector_jax.control.disturbance import NO_DISTURBANCE
 from hector_jax.control.legs import Measurement
+from hector_jax.control.parameters import without_numbers
 from hector_jax.control.reference import Command, anchor_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
@@ -96,7 +97,7 @@ def _plans(
 ) -> tuple[Wrench, Array, Array]:
     """Return wrenches, stance feet and residuals of the plans."""
     initial, own, *plans = walk
-    anchor, parameters = anchor_at(robot, initial, 0), config.parameters(weights)
+    anchor, parameters = anchor_at(robot, initial, 0), config.parameters(without_numbers(weights))
 
     def one(disturbance: Disturbance, inputs: tuple) -> tuple[Disturbance, tuple]:
         desired, state, joints, tick = inputs

@@ -8,6 +8,7 @@ The inputs are those of `PlanInputs`, by entries named like its leaves, such as 
 and `weights.Q.position` (N, 3); its plans are `force`, `moment` and `touchdown` (N, feet, 3).
 """
 
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,6 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hector_jax.control.controller import WalkConfig
+from hector_jax.control.parameters import Tunable, name_of, numbers_of, own_names
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights, direction_names
 from hector_jax.core.geometry import rotation_from_euler
@@ -100,18 +102,21 @@ def plan_inputs(
     )
 
 
-def called_plans(call: CallPlans, config: WalkConfig, inputs: PlanInputs) -> CalledPlans:
+def called_plans(
+    call: CallPlans, config: WalkConfig, inputs: PlanInputs, numbers: Sequence[Tunable] = ()
+) -> CalledPlans:
     """Call a controller along a walk, for `grounded.fit_grounding`.
 
     Args:
         call: the controller, such as `call_planner` of a program.
         config: ticks between plans.
         inputs: from `plan_inputs`.
+        numbers: of the controller, that its plans use.
 
     Raises:
         InputError: see `call_planner`; or no plan is solved.
     """
-    called = call_along(call, inputs, plans_at(config, inputs))
+    called = call_along(call, inputs, plans_at(config, inputs), numbers)
     if not called.made.any():
         raise InputError("the planner solves no plan of a walk: all its rows have NaN")
     return called
@@ -141,7 +146,7 @@ class CallCheck(NamedTuple):
     parity: Parity  # of the plans by call, in place of those of a twin
     memory: float  # [N, N m] largest difference between two calls, the other one in reverse order
     jumps: float  # share of the plans that jump when a state or a foot is moved a little
-    unused_weights: tuple[str, ...]  # names of the weights that change no plan
+    unused_weights: tuple[str, ...]  # names of the weights, and of its numbers, that change no plan
     touchdowns_follow: bool  # whether the touchdowns follow the velocity
     convention: tuple[str, ...]  # that makes them those of the log, see `_closest`
     distance: float  # [N, N m] largest difference then
@@ -195,7 +200,8 @@ def compare_calls(
     Raises:
         InputError: see `called_plans`.
     """
-    first = called_plans(call, config, inputs)
+    numbers = [of for of in numbers_of(robot.description) if not of.of_legs]
+    first = called_plans(call, config, inputs, numbers)
     # another order, in which a plan that rests on the one before it is another
     rows = np.flatnonzero(first.made)
     again = call_rows(call, inputs, rows[::-1])[::-1] - first.values[rows]
@@ -216,7 +222,8 @@ def compare_calls(
     by_body, by_weights = np.split(first.slopes[first.made], [body], axis=-1)
     changes = np.abs(by_body[..., :6, :]).max(axis=(1, 2)) * move_sizes(body)
     weight = float(robot.mass * np.linalg.norm(robot.gravity))
-    names = direction_names(inputs.weights)
+    names = *direction_names(inputs.weights), *own_names(inputs.weights)
+    asked = {*direction_names(inputs.weights), *map(name_of, numbers)}
     stands = np.asarray(inputs.contact)[rows]
     euler = inputs.state.euler[rows]
     convention, distance = _closest(logged[rows], called[rows], euler, stands)
@@ -225,7 +232,9 @@ def compare_calls(
         parity,
         memory=float(np.nanmax(np.abs(again))),
         jumps=float(np.mean(changes.max(axis=1) > JUMP * weight)),
-        unused_weights=tuple(name for name, none in zip(names, unused, strict=True) if none),
+        unused_weights=tuple(
+            name for name, none in zip(names, unused, strict=True) if none and name in asked
+        ),
         touchdowns_follow=bool(np.any(by_body[..., 6:8, 9:11])),
         convention=convention,
         distance=distance,

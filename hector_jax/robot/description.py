@@ -20,6 +20,7 @@
     [loss]                             # weights of the loss terms: L_Eul, L_pos, L_ctrl
     [tuning]                           # fields of TuningSettings
     [plants]                           # fields of PlantSizes
+    [numbers.NAME]                     # of a user's controller: fields of Number
 
 The model must be named; all other defaults are those of assets/hector.toml,
 but without [slip] the controller does not react to slips. Masses, lengths, joint
@@ -36,6 +37,7 @@ import jax
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import NOT_NEGATIVE, POSITIVE, check, from_table, read_toml
 from hector_jax.core.trajectory import FEET, MAX_TILT, MIN_HEIGHT
+from hector_jax.robot.numbers import Number, read_numbers
 
 _PACKAGE = Path(__file__).parents[1]
 _INSTALLED = _PACKAGE / "assets"  # the folder in a wheel
@@ -125,6 +127,7 @@ class Description:
     loss: tuple[tuple[str, float], ...] = ()  # alphas by term; missing ones are the paper's
     plants: PlantSizes = PlantSizes()
     tuning: TuningSettings = TuningSettings()
+    numbers: tuple[tuple[str, Number], ...] = ()  # of a user's controller, by name
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "control", _as_tuples(self.control))
@@ -320,6 +323,7 @@ class _File:
     loss: dict[str, float] | None = None
     tuning: TuningSettings = TuningSettings()
     plants: PlantSizes = PlantSizes()
+    numbers: dict[str, dict] | None = None
 
     def __post_init__(self) -> None:
         legs, feet = tuple(self.joints.legs), self.feet and tuple(self.feet.feet)
@@ -380,6 +384,7 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
         loss=_as_tuples(file.loss or {}),
         tuning=file.tuning,
         plants=file.plants,
+        numbers=read_numbers(str(path), file.numbers or {}),
     )
 
 

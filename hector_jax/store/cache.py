@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hector_jax.control.parameters import tunable
+from hector_jax.control.parameters import is_ours, name_of, tunable
 from hector_jax.core.console import say
 from hector_jax.core.environment import code_hash
 from hector_jax.core.files import locked
@@ -50,7 +50,7 @@ def content_key(*parts: Any, code: Sequence[str]) -> str:
         return tree_hash(part) if isinstance(part, tuple | None) else repr(part)
 
     others = [getattr(getattr(part, "weights", part), "others", ()) for part in parts]
-    boxes = sorted({tunable(name) for names in others for name in names})
+    boxes = sorted({tunable(x) for names in others for x in names if is_ours(name_of(x))})
     key = "\n".join([*map(text, parts), repr(boxes), code_hash(*code)])
     return hashlib.sha256(key.encode()).hexdigest()[:12]
 

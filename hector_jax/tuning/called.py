@@ -9,7 +9,7 @@ part of the plan, since stepping is what keeps a robot upright: without them the
 walk grow without bound. The yaws of feet are not moved; a foot in the air moves with its touchdown.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Int
 from hector_jax import qp
 from hector_jax.control.controller import Plan
 from hector_jax.control.footstep import Feet
-from hector_jax.control.parameters import stepped
+from hector_jax.control.parameters import Tunable, nudged, own_names, stepped
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights, direction_names
 from hector_jax.core.arrays import Array
@@ -72,7 +72,8 @@ class CalledPlans(NamedTuple):
     contact: Bool[Array, "T feet"]
     made: Bool[Array, " T"]  # whether there is a plan at this tick, else the last one is kept
     values: Float[Array, "T feet 9"]  # force, moment, touchdown
-    slopes: Float[Array, "T feet 9 moves"]  # by `body` and by the steps from the weights
+    # by `body`, by the steps of Q and R, and by the numbers of the controller (`own_names`)
+    slopes: Float[Array, "T feet 9 moves"]
 
     def plan(
         self,
@@ -87,7 +88,8 @@ class CalledPlans(NamedTuple):
 
         Args:
             state, feet: estimated.
-            steps: from the weights with which the plans were called, see `parameters.stepped`.
+            steps: from the weights with which the plans were called: of Q and R by
+                `parameters.stepped`, and changes of the numbers.
             last: wrench of the tick before.
             disturbance: is kept.
         """
@@ -116,7 +118,12 @@ def call_rows(
     return np.concatenate(call(asked), axis=-1)
 
 
-def call_along(call: CallPlans, inputs: PlanInputs, made: Bool[np.ndarray, " T"]) -> CalledPlans:
+def call_along(
+    call: CallPlans,
+    inputs: PlanInputs,
+    made: Bool[np.ndarray, " T"],
+    numbers: Sequence[Tunable] = (),
+) -> CalledPlans:
     """Call a controller along a walk, at each plan once and once more for each number moved.
 
     Where it does not solve a plan the last one is kept, and a moved one counts as no change.
@@ -125,21 +132,26 @@ def call_along(call: CallPlans, inputs: PlanInputs, made: Bool[np.ndarray, " T"]
         call: the controller.
         inputs: at the T ticks of the walk; its weights have no leading axis.
         made: ticks at which the controller plans.
+        numbers: of the controller, that are moved too; by its other numbers the slopes are zero.
 
     Raises:
         InputError: from `call`.
     """
     body, rows = np.asarray(_body(inputs.state, inputs.feet)), np.flatnonzero(made)
-    feet, numbers = inputs.contact.shape[1], len(direction_names(inputs.weights))
-    sizes = np.append(move_sizes(body.shape[1]), np.full(numbers, LOG_STEP))
-    moves = np.concatenate([np.zeros((1, len(sizes))), np.diag(sizes)])
-    of_body, of_weights = np.split(moves, [body.shape[1]], axis=1)
+    feet, start, count = inputs.contact.shape[1], inputs.weights, body.shape[1]
+    by_logs = [stepped(start, x) for x in LOG_STEP * np.eye(len(direction_names(start)))]
+    by_name = {of.name: nudged(start, of, LOG_STEP)[0] for of in numbers}
+    by_numbers = {name: by_name.get(name, start) for name in own_names(start)}
+    changes = [float(x.others[name] - start.others[name]) for name, x in by_numbers.items()]
+    sizes = np.concatenate([move_sizes(count), np.full(len(by_logs), LOG_STEP), changes])
+    moved = np.flatnonzero(sizes)
+    sets = [start, *(([start] * count + by_logs + [*by_numbers.values()])[i] for i in moved)]
+    of_body = np.concatenate([np.zeros((1, count)), np.diag(sizes)[moved, :count]])
 
     def repeated(x: Any) -> np.ndarray:
-        return np.tile(np.asarray(x)[rows], (len(moves), *[1] * (np.ndim(x) - 1)))
+        return np.tile(np.asarray(x)[rows], (len(sets), *[1] * (np.ndim(x) - 1)))
 
     parts = np.split(repeated(body) + np.repeat(of_body, len(rows), axis=0), [3, 6, 9, 12], axis=1)
-    sets = [stepped(inputs.weights, steps) for steps in of_weights]
     asked = inputs._replace(
         time=repeated(inputs.time),
         state=State(*parts[:4]),
@@ -147,8 +159,9 @@ def call_along(call: CallPlans, inputs: PlanInputs, made: Bool[np.ndarray, " T"]
         contact=repeated(inputs.contact),
         weights=jax.tree.map(lambda *x: np.repeat(np.stack(x), len(rows), axis=0), *sets),
     )
-    answers = np.concatenate(call(asked), axis=-1).reshape(len(moves), len(rows), feet, 9)
-    slopes = np.nan_to_num(answers[1:] - answers[0]) / np.reshape(sizes, (-1, 1, 1, 1))
+    answers = np.concatenate(call(asked), axis=-1).reshape(len(sets), len(rows), feet, 9)
+    slopes = np.zeros((len(sizes), *answers.shape[1:]))
+    slopes[moved] = np.nan_to_num(answers[1:] - answers[0]) / sizes[moved].reshape(-1, 1, 1, 1)
     solved = np.isfinite(answers[0]).all(axis=(1, 2))
     at = np.maximum(np.cumsum(made) - 1, 0)  # of the last plan; between plans none is used
     made = made & solved[at]

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.control.parameters import gradient_by_weights, stepped, steps_between
+from hector_jax.control.parameters import Other, gradient_by_weights, stepped, steps_between
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import Trajectory
@@ -63,7 +63,8 @@ def least_squares(
     loss: Loss,
     *,
     walk: Walk = rollout,
-    others: tuple[str, ...] = (),
+    others: tuple[Other, ...] = (),
+    columns: Float[Array | np.ndarray, "rows n"] | float = 0.0,
 ) -> tuple[Evaluation, Float[Array, "n n"]]:
     """Compute the loss, its gradient and its Gauss-Newton matrix in one program, in forward mode.
 
@@ -73,7 +74,8 @@ def least_squares(
         config, scenario, walk: of the rollout, see `evaluate`.
         weights: the point of evaluation; all feet share one R.
         loss: terms and their weights.
-        others: names of numbers beside Q and R.
+        others: numbers beside Q and R.
+        columns: are added to J: derivatives by numbers that the model does not have.
 
     Returns:
         The evaluation, and the matrix in the n coordinates of `parameters.stepped`.
@@ -86,6 +88,7 @@ def least_squares(
         return r, (r, trajectory)
 
     J, (r, trajectory) = jax.jacfwd(rows, has_aux=True)(zero)
+    J = J + columns
     gradient = gradient_by_weights(weights, 2.0 * r @ J, others)
     fallen, residual = jnp.mean(1.0 * trajectory.fallen), jnp.max(trajectory.residual)
     found = Evaluation(r @ r, losses(loss, trajectory), gradient, fallen, residual)

@@ -27,6 +27,7 @@ from jaxtyping import Float, Int
 
 from hector_jax.control import parameters
 from hector_jax.control.controller import WalkConfig
+from hector_jax.control.parameters import Other
 from hector_jax.control.weights import Weights, directions, nominal, weights_to_vector
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError, plural, short_repr, unknown
@@ -53,7 +54,7 @@ class TuneConfig:
 
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
     loss: tuple = PAPER_LOSS  # of `LossTerm`
-    others: tuple[str, ...] = ()  # names in `parameters.TUNABLES`, tuned with Q and R
+    others: tuple[Other, ...] = ()  # numbers that are tuned with Q and R
     rule: str = "gauss_newton"  # or the paper's: "relative", "literal" (theta - beta dL/dtheta)
     # of "gauss_newton": share of the loss at the start, for e-folds of |z|^2 = 2
     ridge: Annotated[float, NOT_NEGATIVE] = 0.003
@@ -73,7 +74,7 @@ class TuneConfig:
         got = short_repr(self.others)
         if self.others and self.rule == "literal":
             raise InputError(f"TuneConfig.others must be empty with the rule literal, got {got}")
-        for name in self.others:
+        for name in (x for x in self.others if isinstance(x, str)):
             if reason := _why_not_tunable(self.rollout.walk, name):
                 expected = "must be numbers that a gradient can tune"
                 raise InputError(f"TuneConfig.others {expected}, got {got}: {reason}")

@@ -18,6 +18,7 @@ from hector_jax.control import parameters
 from hector_jax.control.controller import Plan, measured_feet
 from hector_jax.control.footstep import Feet
 from hector_jax.control.legs import Measurement
+from hector_jax.control.parameters import without_numbers
 from hector_jax.control.reference import Anchor, anchor_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
@@ -120,7 +121,9 @@ def fit_grounding(
         (commands, disturbance), (begin, end, error, tick, row) = memory, inputs
         carry = carry_from(begin, anchor, commands, disturbance)
         planner = _planner(row, carry, weights, weights)
-        after, _ = step_carry(config, scenario, weights, carry, tick, error=error, planner=planner)
+        after, _ = step_carry(
+            config, scenario, without_numbers(weights), carry, tick, error=error, planner=planner
+        )
         residual = jax.tree.map(jnp.subtract, end, MeasuredState(after.state, after.feet))
         return (after.commands, after.disturbance), _turned(residual, -begin.state.euler[2])
 
@@ -139,7 +142,9 @@ def _planner(
     """Return what plans in a tick: another controller, called with `start`; None: this one."""
     if called is None:
         return None
-    steps = parameters.steps_between(start, weights)
+    names = parameters.own_names(start)
+    changes = [weights.others[name] - start.others[name] for name in names]
+    steps = jnp.append(parameters.steps_between(start, weights), jnp.array(changes))
     last = jax.tree.map(lambda x: x[0], carry.commands)
     return partial(called.plan, steps=steps, last=last, disturbance=carry.disturbance)
 
@@ -171,7 +176,8 @@ def grounded_rollout(config: RolloutConfig, grounding: Grounding, weights: Weigh
     def step(carry: Carry, inputs: tuple) -> tuple[Carry, Trajectory]:
         error, residual, tick, row = inputs
         options = {"error": error, "planner": _planner(row, carry, walked, weights)}
-        after, sample = step_carry(config, scenario, weights, carry, tick, **options)
+        twin = without_numbers(weights)
+        after, sample = step_carry(config, scenario, twin, carry, tick, **options)
         residual = _turned(residual, carry.state.euler[2])
         state, feet = jax.tree.map(jnp.add, MeasuredState(after.state, after.feet), residual)
         fallen = carry.fallen | has_fallen(state, *scenario.robot.description.limits)

@@ -15,6 +15,7 @@ from hector_jax.robot.model import Robot
 from hector_jax.sim.world import Imperfections, hfs, hfs_with_motors, noisy
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import smoother
+from hector_jax.walk_tuning.moved import walks_needed
 
 DRAWS = 4  # variations of the model for each command of `best`
 LIMIT, WIDTH, FEEDBACK = 0.19, 7 / 8, 2 / 3
@@ -36,7 +37,7 @@ def drawn_plants(robot: Robot, count: int, first_seed: int = _FIRST_SEED) -> lis
 
 
 def walk_plants(
-    robot: Robot, count: int | None, walks: int | None, commands: int
+    robot: Robot, count: int | None, walks: int | None, commands: int, numbers: int = 0
 ) -> tuple[list[Imperfections], int]:
     """Return the plants of a tuning on walks, and its budget of walks.
 
@@ -45,18 +46,21 @@ def walk_plants(
         count: number of plants, 0 for the hfs itself; None: so that MANY_SETS sets can walk.
         walks: budget; None: that of `best`.
         commands: number of commands.
+        numbers: how many have their slopes by walks.
 
     Raises:
-        InputError: the budget is less than two walks in each case.
+        InputError: the budget is less than two walks in each case, and those for the slopes.
     """
+    first, later = walks_needed(commands, numbers)  # on one plant
     if walks is None:
         count = PLANTS if count is None else count
         walks = SETS * max(count, 1) * commands
     elif count is None:
-        count = int(np.clip(walks // (MANY_SETS * commands), 1, MOST_PLANTS))
+        count = int(np.clip(walks // (first + (MANY_SETS - 1) * later), 1, MOST_PLANTS))
     plants = drawn_plants(robot, count) or [hfs(robot.description)]
-    if 0 < walks < (least := 2 * len(plants) * commands):
+    if 0 < walks < (least := (first + commands) * len(plants)):
         cases = f"{plural(commands, 'command')} on {plural(len(plants), 'plant')}, twice"
+        cases += f", and with {plural(numbers, 'number')} moved" * (numbers > 0)
         raise InputError(f"--walks must be 0 or at least {least} ({cases}), got {walks}")
     return plants, walks
 

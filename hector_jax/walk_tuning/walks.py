@@ -11,6 +11,7 @@ anew in each call and no walk is made twice:
 - `walks.jsonl`: the settings, then a line for each weight set that has walked.
 - `weights/3.json`: the weights of set 3.
 - `logs/3-0.npz`: its log in case 0, at the plan interval, or the file that was added.
+- `logs/3-KP-0.npz`: the same with the number KP moved (`moved`).
 - `starts/with`: the same of a set that was tried as the start.
 """
 
@@ -18,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import replace
 from functools import partial
-from itertools import repeat
+from itertools import product, repeat
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,12 +29,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hector_jax.control import parameters
+from hector_jax.control.parameters import Tunable
 from hector_jax.control.reference import standing_anchor
 from hector_jax.control.weights import Weights
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.console import bar, say
 from hector_jax.core.environment import code_hash
-from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.journal import continue_journal, write_rows
 from hector_jax.core.trajectory import no_samples
@@ -51,9 +52,9 @@ from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
 from hector_jax.tuning.rollout import Scenario
 from hector_jax.tuning.status import StepStatus
 from hector_jax.walk_tuning.campaign import Campaign
+from hector_jax.walk_tuning.moved import STEP, Moved, MovedWalks, columns_by_walks, numbers_by_walks
 
 RECORD = "walks.jsonl"
-START_PLANTS = 3  # on which several starts walk
 _FALL = 1.0  # log L of a fall above the largest of the start
 
 
@@ -95,6 +96,10 @@ class Waiting(Exception):  # noqa: N818
     """The walks of a weight set have not been made yet."""
 
 
+class Spent(Exception):  # noqa: N818
+    """No walks are left for another set."""
+
+
 Ask = Callable[[int, Weights], Sequence[ScoredLog]]
 """Returns the scored logs of a set by its number, one for each case, or raises `Waiting`."""
 
@@ -122,11 +127,16 @@ def walk_case(campaign: Campaign, weights: Weights, case: int) -> ScoredLog:
 
 
 def _slope(
-    campaign: Campaign, weights: Weights, case: int, log: Log
+    campaign: Campaign,
+    weights: Weights,
+    case: int,
+    log: Log,
+    moved: Mapping[str, Moved] = {},
 ) -> tuple[Evaluation, Float[np.ndarray, "n n"]] | InputError:
     """Return loss, gradient and matrix of the plain rigid body grounded on a walk.
 
-    If the planner of the user gives no plans of it this returns its error: others may go on.
+    By the numbers that were `moved` they are by walks, see `columns_by_walks`. If the planner of
+    the user gives no plans of it this returns its error: others may go on.
     """
     config, robot = campaign.config, campaign.robot
     effect = network.effect_of(None, config.rollout.walk)
@@ -136,11 +146,15 @@ def _slope(
         controller = config.rollout.walk
         inputs = plan_inputs(controller, robot, weights, scenario.command, walk)
         try:
-            called = called_plans(partial(call_planner, campaign.planner), controller, inputs)
+            plans = partial(call_planner, campaign.planner)
+            numbers = [x for x in config.others if isinstance(x, Tunable) and not x.of_legs]
+            called = called_plans(plans, controller, inputs, numbers)
         except InputError as error:
             return error
     grounding = fit_grounding(config.rollout, scenario, weights, walk, called=called)
-    options = {"walk": grounded_rollout, "others": config.others}
+    options: dict[str, Any] = {"walk": grounded_rollout, "others": config.others}
+    if numbers_by_walks(config.others):
+        options["columns"] = columns_by_walks(config, robot, scenario.command, log, moved)
     found = least_squares_jit(config.rollout, grounding, weights, config.loss, **options)
     return jax.device_get(found)
 
@@ -150,45 +164,10 @@ def first_slope(campaign: Campaign) -> None:
     _slope(campaign, campaign.start, 0, walk_case(campaign, campaign.start, 0).log)
 
 
-# The choice of the start
-
-
-def with_best_start(
-    pool: Executor, campaign: Campaign, starts: Mapping[str, Weights]
-) -> tuple[str, Campaign]:
-    """Return the name of that of several starts which walks best, and the campaign from it.
-
-    Each walks on the first plants; of those that fall least often it is that with the least mean of
-    log L, a fall bounded as in the tuning. Its walks are not made again.
-
-    Args:
-        pool, campaign: as for `tune_on_walks`; its own start does not matter.
-        starts: weights by name.
-    """
-    tried, rows, few = [], [], campaign.plants[:START_PLANTS]
-    with bar("walking with each set that the tuning on walks may begin with") as report_progress:
-        for name, start in starts.items():
-            report_progress(len(tried), len(starts), name)
-            folder = campaign.folder / "starts" / name
-            one = replace(campaign, folder=folder, start=start, plants=few)
-            continue_journal(folder / RECORD, _head(one), "walks of a start", dict, _remedy(one))
-            save_weights(weights_path(folder, 0), one.start)
-            rows.append([walked.loss for walked in walk_all(pool, one, 0, one.start)])
-            tried.append(one)
-    losses = np.array(rows)
-    means = _bounded_logs(losses, losses).mean(axis=1)
-    best = tried[np.lexsort((means, (~np.isfinite(losses)).sum(axis=1)))[0]]
-    name = best.folder.name
-    say(f"it begins with `{name}`")
-    for path, kept in zip(log_paths(best, 0), log_paths(campaign, 0), strict=False):
-        write_file(kept, path.read_bytes())
-    return name, replace(campaign, start=best.start)
-
-
 # The objective
 
 
-def _bounded_logs(
+def bounded_logs(
     losses: Float[np.ndarray, "*cases"], known: Float[np.ndarray, "*others"]
 ) -> Float[np.ndarray, "*cases"]:
     """Return log L, that of a fall and of what is worse a bound above the largest known one."""
@@ -199,12 +178,27 @@ def _bounded_logs(
 class _Walks:
     """The objective of `difftune.descend` on walks; remembers the sets."""
 
-    def __init__(self, pool: Executor, campaign: Campaign, ask: Ask) -> None:
+    def __init__(
+        self, pool: Executor, campaign: Campaign, ask: Ask, walks: int | None = None
+    ) -> None:
         self.pool, self.campaign, self.ask = pool, campaign, ask
         self.losses: list[np.ndarray] = []
+        self.left = np.inf if walks is None else walks
+        self.state: TuneState | None = None
+        self.moved = MovedWalks(campaign.config.others)
 
     def place(self, state: TuneState) -> TuneState:
-        """Return the state at the set that has walked, should the code place it elsewhere."""
+        """Return the state at the set that has walked, should the code place it elsewhere.
+
+        Raises:
+            Spent: it cannot walk.
+        """
+        if self.left < len(self.campaign.cases):
+            raise Spent
+        self.state = self._placed(state)
+        return self.state
+
+    def _placed(self, state: TuneState) -> TuneState:
         path = weights_path(self.campaign.folder, len(self.losses))
         config = self.campaign.config
         trial = jax.device_get(difftune.trial_weights(config, state))
@@ -223,14 +217,22 @@ class _Walks:
         """Walk a set; value and slope of the mean of log L."""
         campaign, number = self.campaign, len(self.losses)
         logs = self.ask(number, weights)
+        self.left -= len(logs)
         losses = np.array([walked.loss for walked in logs])
         stood = np.isfinite(losses)
         self.losses.append(losses)
-        value = float(np.exp(_bounded_logs(losses, self.losses[0]).mean()))
-        refused = stood.sum() < np.isfinite(self.losses[0]).sum()
-        on = [] if refused else np.flatnonzero(stood).tolist()  # a slope takes as long as a walk
+        value = float(np.exp(bounded_logs(losses, self.losses[0]).mean()))
+        gains, refused = (
+            self._gains(weights, value),
+            stood.sum() < np.isfinite(self.losses[0]).sum(),
+        )
+        # a slope takes as long as a walk
+        on = np.flatnonzero(stood).tolist() if gains and not refused else []
         some = [logs[case].log for case in on]
-        found = list(self.pool.map(_slope, repeat(campaign), repeat(weights), on, some))
+        if on:
+            self._move(weights, dict(zip(on, some, strict=True)))
+        moved = [self.moved.of_case(case) for case in on]
+        found = list(self.pool.map(_slope, repeat(campaign), repeat(weights), on, some, moved))
         errors = [x for x in found if isinstance(x, InputError)]
         if errors and len(errors) == len(found) and not number:
             raise errors[0]
@@ -245,11 +247,40 @@ class _Walks:
 
         numbers = len(parameters.step_names(weights, campaign.config.others))
         gradient, matrix = jax.tree.map(np.zeros_like, weights), np.zeros((numbers, numbers))
-        residual, fallen = np.zeros(()), np.asarray(float(not usable))
+        residual, fallen = np.zeros(()), np.asarray(float(gains and not usable))
         if usable:
             gradient, matrix = mean([(found.gradient, curved) for found, curved in usable])
             residual = np.max([found.residual for found, _ in usable])
+            self.moved.curvature = np.diag(matrix)
         return Evaluation(np.asarray(value), {}, gradient, fallen, np.asarray(residual)), matrix
+
+    def _gains(self, weights: Weights, value: float) -> bool:
+        """Return whether a set is accepted if it falls no more often than the start."""
+        zero = np.zeros(())
+        found = Evaluation(np.asarray(value), {}, jax.tree.map(np.zeros_like, weights), zero, zero)
+        if self.state is None:  # nothing to compare with
+            return True
+        status = difftune.trial_status(self.campaign.config, self.state, found)
+        return int(status) == StepStatus.ACCEPTED
+
+    def _move(self, weights: Weights, stood: Mapping[int, Log]) -> None:
+        """Walk a set again with numbers moved, unless no walks are left for a set after that."""
+        campaign, number = self.campaign, len(self.losses) - 1
+        due = self.moved.due(number)
+        if self.left < len(due) * len(stood) + len(campaign.cases):
+            return
+        self.left -= len(due) * len(stood)
+        back = {c for c in stood if (c + c // len(campaign.commands)) % 2}
+        nudges = {
+            (of.name, case): parameters.nudged(weights, of, -STEP if case in back else STEP)
+            for of, case in product(due, stood)
+        }
+        sets = {(f"{number}-{name}", case): x for (name, case), (x, _) in nudges.items()}
+        found = walk_sets(self.pool, campaign, sets).values()
+        for ((name, case), (_, step)), walked in zip(nudges.items(), found, strict=True):
+            self.moved.sets[name] = number
+            if np.isfinite(walked.loss):
+                self.moved.walks[name, case] = Moved(step, stood[case], walked.log)
 
 
 def tune_on_walks(
@@ -261,7 +292,8 @@ def tune_on_walks(
         pool: worker processes.
         campaign: the settings.
         ask: makes the walks of a set; by default the engine of the campaign does.
-        walks: budget; whole sets walk in all cases. None: the iterations of the settings.
+        walks: budget, of those with numbers moved too; whole sets walk in all cases. None: the
+            iterations of the settings.
 
     Returns:
         The sets; if the start falls in all cases it alone.
@@ -269,12 +301,12 @@ def tune_on_walks(
     Raises:
         InputError: the folder holds the record of another campaign, or a damaged one.
     """
-    head = _head(campaign)
-    continue_journal(campaign.folder / RECORD, head, "a tuning on walks", dict, _remedy(campaign))
+    head = record_head(campaign)
+    continue_journal(campaign.folder / RECORD, head, "a tuning on walks", dict, remedy(campaign))
     config, cases = campaign.config, len(campaign.cases)
     if walks is not None:
         config = replace(config, iterations=max(walks // cases - 1, 1))
-    objective = _Walks(pool, campaign, ask or partial(walk_all, pool, campaign))
+    objective = _Walks(pool, campaign, ask or partial(walk_all, pool, campaign), walks)
     sets: list[WalkedSet] = []
     with bar(f"tuning on walks, {plural(cases, 'case')}") as report_progress:
 
@@ -298,6 +330,8 @@ def tune_on_walks(
             write_record()  # without sets whose logs were taken back
             waiting = load_weights(weights_path(campaign.folder, len(sets)), campaign.robot)
             return WalkTuning(sets, waiting, "")
+        except Spent:
+            return WalkTuning(sets, None, f"no more of its {plural(walks or 0, 'walk')} are left")
         except InputError:
             if sets and not sets[0].accepted:
                 return WalkTuning(sets, None, "the start fell or was not solved in all walks")
@@ -305,20 +339,20 @@ def tune_on_walks(
     return WalkTuning(sets, None, tuning.reason)
 
 
-def _remedy(campaign: Campaign) -> str:
+def remedy(campaign: Campaign) -> str:
     """Return what to do with a folder of another campaign."""
     anew = f" and begin anew with hector propose --start {campaign.folder}/weights/N.json"
     return f"choose another folder{anew * campaign.by_logs}"
 
 
-def _head(campaign: Campaign) -> dict[str, Any]:
+def record_head(campaign: Campaign) -> dict[str, Any]:
     """Return what identifies a campaign, as JSON values."""
     head: dict[str, Any] = {
         "format": 4,
         "start": weights_tree(campaign.start),
         "commands": {name: tree_hash(command) for name, command in campaign.commands.items()},
         "plants": [plant and tree_hash(plant) for plant in campaign.plants],
-        "numbers": list(campaign.config.others),
+        "numbers": list(map(parameters.name_of, campaign.config.others)),
         "seconds": campaign.seconds,
     }
     if campaign.by_logs:  # data: neither code nor loss can make them those of another campaign
@@ -332,17 +366,26 @@ def _head(campaign: Campaign) -> dict[str, Any]:
     }
 
 
+def walk_sets(
+    pool: Executor, campaign: Campaign, sets: Mapping[tuple[str, int], Weights]
+) -> dict[tuple[str, int], ScoredLog]:
+    """Walk sets, by name and case, and keep each walk in the folder as it ends."""
+    robot = campaign.robot
+    like = ScoredLog(0.0, log_of(no_samples(len(robot.joint_lower), len(robot.foot_point))))
+    paths = {(name, case): log_paths(campaign, name)[case] for name, case in sets}
+    missing = [at for at, path in paths.items() if not path.exists()]
+    running = {pool.submit(walk_case, campaign, sets[at], at[1]): at for at in missing}
+    for job in as_completed(running):
+        save_tree(paths[running[job]], job.result(), kind="log", robot=robot)
+    return {at: load_tree(x, like, kind="log", robot=robot)[0] for at, x in paths.items()}
+
+
 def walk_all(
     pool: Executor, campaign: Campaign, number: int, weights: Weights
 ) -> Sequence[ScoredLog]:
-    """Walk a set in all cases, and keep each walk in the folder as it ends."""
-    robot, paths = campaign.robot, log_paths(campaign, number)
-    like = ScoredLog(0.0, log_of(no_samples(len(robot.joint_lower), len(robot.foot_point))))
-    missing = [case for case, path in enumerate(paths) if not path.exists()]
-    running = {pool.submit(walk_case, campaign, weights, case): case for case in missing}
-    for job in as_completed(running):
-        save_tree(paths[running[job]], job.result(), kind="log", robot=robot)
-    return [load_tree(path, like, kind="log", robot=robot)[0] for path in paths]
+    """Walk a set in all cases."""
+    cases = range(len(campaign.cases))
+    return list(walk_sets(pool, campaign, {(str(number), c): weights for c in cases}).values())
 
 
 def weights_path(folder: Path, number: int) -> Path:
@@ -350,7 +393,7 @@ def weights_path(folder: Path, number: int) -> Path:
     return folder / "weights" / f"{number}.json"
 
 
-def log_paths(campaign: Campaign, number: int) -> list[Path]:
+def log_paths(campaign: Campaign, name: int | str) -> list[Path]:
     """Return the files of the logs of a set, one for each case."""
-    names = [f"{number}-{case}.npz" for case in range(len(campaign.cases))]
+    names = [f"{name}-{case}.npz" for case in range(len(campaign.cases))]
     return [campaign.folder / "logs" / name for name in names]
