@@ -63,7 +63,7 @@ Run = Annotated[Path, PathKind.RUN]
 Folder = Annotated[Path, PathKind.FOLDER]
 
 COMMANDS: dict[str, type[Any]] = {}  # the flags of each command, by its one or two words
-_GROUPS = {"log": ("check", "twin", "add"), "steps": ("collect", "train", "grfm")}
+_GROUPS = {"log": ("check", "twin", "foretell", "add"), "steps": ("collect", "train", "grfm")}
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))

@@ -52,8 +52,7 @@ OVERVIEW = {
         "steps grfm": "how well that net predicts walks that it never saw",
     },
     "This machine": {"doctor": "versions, devices, cache and video, with a test"},
-}
-"""Each command in a line, under headings, in the order of `hector --help`."""
+}  # each command in a line, in the order of `hector --help`
 
 _HEAD = """hector tunes the weights of a walking robot's model predictive controller.
 

@@ -1,6 +1,6 @@
 """A controller of the user: what the logs of its walks show, its twin, a tuning on its walks."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,6 +12,7 @@ from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import Check, Tune, Twin
 from hector_jax.control.controller import walk_config
+from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.console import say
 from hector_jax.core.files import write_json
@@ -39,6 +40,7 @@ from hector_jax.sim.world import hfs
 from hector_jax.store import tunings
 from hector_jax.store.run import RESULT
 from hector_jax.store.setup import Setup
+from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.verdict import judging, metrics
 from hector_jax.walk_tuning import best_set
 from hector_jax.walk_tuning.campaign import Campaign
@@ -149,24 +151,10 @@ def tune_walker(folder: Path, args: Tune) -> None:
     """
     robot = load_robot(args.robot)
     trajectories = run_folder.trajectories(args, robot)
-    numbers = arguments.own_numbers(args, robot)
-    config = tunings.tune_config(robot, others=numbers)
+    config = tunings.tune_config(robot, others=arguments.own_numbers(args, robot))
     config = arguments.with_length(config, trajectories[0])
-    seconds = config.rollout.ticks * config.rollout.walk.gait.tick
-    assert args.walks is not None  # checked with the flags
-    commands = {trajectory.name: trajectory.command for trajectory in trajectories}
-    campaign = Campaign(
-        folder / "walks",
-        best_set.on_walks(config),
-        robot,
-        arguments.weights_by_name(args.start, robot),
-        commands,
-        best_set.walk_plants(
-            robot, args.walk_plants, args.walks, len(commands), len(numbers_by_walks(numbers))
-        )[0],
-        arguments.engine_of(args),
-        arguments.planner_of(args),
-    )
+    campaign = _campaign(folder, args, config, robot, trajectories)
+    commands, seconds = campaign.commands, campaign.seconds
     _check_first(args, campaign, seconds)
     _say_cost(campaign)
     with workers(args.processes, args.cluster) as pool:
@@ -203,6 +191,28 @@ def tune_walker(folder: Path, args: Tune) -> None:
     if means["best"] >= means["start"]:
         say("on plants that were not walked `best` is no better than the start: keep that")
     say(f"the weights are {folder / 'weights' / 'best.json'}")
+
+
+def _campaign(
+    folder: Path,
+    args: Tune,
+    config: TuneConfig,
+    robot: Robot,
+    trajectories: Sequence[NamedCommand],
+) -> Campaign:
+    """Return the settings of a tuning on the walks of a program."""
+    by_walks = len(numbers_by_walks(config.others))
+    count = len(trajectories), by_walks
+    return Campaign(
+        folder / "walks",
+        best_set.on_walks(config),
+        robot,
+        arguments.weights_by_name(args.start, robot),
+        {trajectory.name: trajectory.command for trajectory in trajectories},
+        best_set.walk_plants(robot, args.walk_plants, args.walks, *count)[0],
+        arguments.engine_of(args),
+        arguments.planner_of(args),
+    )
 
 
 def _say_cost(campaign: Campaign) -> None:

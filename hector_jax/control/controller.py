@@ -59,10 +59,8 @@ class WalkConfig:
     def __post_init__(self) -> None:
         check(self)
         if 2 * self.gait.tick > self.mpc_step + 1e-12:
-            raise InputError(
-                "WalkConfig.gait.tick must be at most half the MPC step, "
-                f"got tick {self.gait.tick} s and step {self.mpc_step} s"
-            )
+            text = f"got tick {self.gait.tick} s and step {self.mpc_step} s"
+            raise InputError(f"WalkConfig.gait.tick must be at most half the MPC step, {text}")
 
     def parameters(self, weights: Weights) -> Parameters:
         """Return the traced numbers of the controller, from the weights, else from this config."""
@@ -286,14 +284,12 @@ def plan(
         feet=feet,
         desired=desired,
     )
-    dt, every = config.gait.tick, config.twin.plan_ticks
-    limits = parameters.mpc.position_limit, parameters.mpc.yaw_limit
-    horizon = limit_errors(horizon, state, reference, *limits)
+    mpc, every = parameters.mpc, config.twin.plan_ticks
+    horizon = limit_errors(horizon, state, reference, mpc.position_limit, mpc.yaw_limit)
     contact, swing_ticks = gait.contact(config.gait, tick), gait.swing_ticks(config.gait, tick)
-    loaded = dt * jnp.any(contact)
-    disturbance = integrate_error(parameters.mpc.integral, disturbance, state, reference, loaded)
-    body = config.twin.body(robot)
-    problem = MpcProblem(body, parameters.mpc, state, horizon, disturbance)
+    loaded = config.gait.tick * jnp.any(contact)
+    disturbance = integrate_error(mpc.integral, disturbance, state, reference, loaded)
+    problem = MpcProblem(config.twin.body(robot), mpc, state, horizon, disturbance)
     solve = partial(solve_mpc, config.mpc, problem, dt=config.mpc_step, max_contacts=max_contacts)
     held = last is not None and every > 1
     wrench, solution = _solve_or_keep(solve, last, tick % every == 0) if held else solve()

@@ -94,18 +94,7 @@ def controller_source(
     Raises:
         InputError: constraints or costs of one's own, which are Python; or a twin.
     """
-    mpc, footsteps = config.mpc, FootstepConfig()
-    ours = footsteps.travel, footsteps.ahead
-    if config.twin != TwinConfig() or (config.footstep.travel, config.footstep.ahead) != ours:
-        raise InputError("a twin is not exported, but a file of numbers is: --into")
-    parts = (*mpc.on("inputs"), *mpc.on("states"))
-    own = [part for part in parts if part not in Constraint.known] + list(mpc.costs)
-    if own:
-        text = "constraints and costs of your own are functions in Python, and the C controller has"
-        listed = ", ".join(map(str, own))
-        raise InputError(f"{text} none: {listed}; it has {', '.join(_SIDES)}")
-    constraints = [str(part) for part in parts]
-    sides = [side for part in constraints for side in _SIDES[part]]
+    sides = [side for part in _constraints(config) for side in _SIDES[part]]
     values = {
         "version": versions().get("hector-jax", "of an unknown version"),
         "robot": tree_hash(robot),
@@ -121,7 +110,7 @@ def controller_source(
         "period": substeps(config),
         "lead": -first_tick(config) * substeps(config),
         "sides": sides,
-        "moments": max(mpc.contact.components) > 2,
+        "moments": max(config.mpc.contact.components) > 2,
         "footholds": config.footstep.rule,
         "closed_form": robot.structure.closed_form,
         "sizes": _sizes(config, len(sides)),
@@ -137,6 +126,21 @@ def controller_source(
     # named by what they are: another export has other names in a program that links both
     text = "".join(render(id="", measured="").values())
     return render(id=hashlib.sha256(text.encode()).hexdigest()[:12], measured=measured)
+
+
+def _constraints(config: WalkConfig) -> list[str]:
+    """Return the names of the constraints; InputError if the C controller cannot have all parts."""
+    mpc, footsteps = config.mpc, FootstepConfig()
+    ours = footsteps.travel, footsteps.ahead
+    if config.twin != TwinConfig() or (config.footstep.travel, config.footstep.ahead) != ours:
+        raise InputError("a twin is not exported, but the numbers of a file are: --into")
+    parts = (*mpc.on("inputs"), *mpc.on("states"))
+    own = [part for part in parts if part not in Constraint.known] + list(mpc.costs)
+    if own:
+        text = "constraints and costs of your own are functions in Python, and the C controller has"
+        listed = ", ".join(map(str, own))
+        raise InputError(f"{text} none: {listed}; it has {', '.join(_SIDES)}")
+    return [str(part) for part in parts]
 
 
 FILES = ("controller.h", "controller.c", "CMakeLists.txt")

@@ -143,7 +143,7 @@ def interval(foretold: float, pairs: Sequence[Sequence[float]]) -> Interval:
 
     >>> pairs = [(-1.0, -1.0 + 0.011 * k) for k in range(-50, 51)]
     >>> [round(x, 2) for x in interval(-0.9, pairs)]
-    [-0.9, -1.36, -0.44]
+    [-0.9, -1.37, -0.43]
     """
     if len(pairs) < FEWEST:
         return Interval(foretold, np.nan, np.nan)
