@@ -18,7 +18,6 @@ from hector_jax.own.log_check import check_log, read_check
 from hector_jax.own.planner import call_planner
 from hector_jax.own.walk_file import read_walk, reference_of
 from hector_jax.own.walk_log import at_ticks, log_of
-from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.store import tunings
 from hector_jax.tuning.difftune import TuneConfig
@@ -59,7 +58,7 @@ def run_foretell(args: Foretell) -> None:
         walk, score = _read(path, config, robot, trajectory.command)
         logged.append(quantities(score))
         found.append(foretell(config, robot, trajectory.command, walk, sets, **options))
-    is_here = robot.description == HECTOR and planner is None and all(map(_is_ours, args.logs))
+    is_here = args.robot is None and all(map(_is_ours, args.logs))
     group = HERE if is_here else ELSEWHERE
     result = {
         "walked": {"name": args.walked, **_mean(logged)},
