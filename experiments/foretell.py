@@ -43,7 +43,15 @@ from hector_jax.sim.standin import FAMILIES
 from hector_jax.sim.world import named_world
 from hector_jax.store import tunings
 from hector_jax.verdict import metrics
-from hector_jax.verdict.foretell import ELSEWHERE, HERE, calibrated, foretell, interval, quantities
+from hector_jax.verdict.foretell import (
+    ELSEWHERE,
+    HERE,
+    calibrated,
+    foretell,
+    interval,
+    log_ratio,
+    quantities,
+)
 
 SPREAD = 0.4  # standard deviation of a random step, in log-weights
 
@@ -139,7 +147,7 @@ def log_job(case: Case, count: int) -> list[Pair]:
         if not score.fallen and not found.scores[name].fallen:
             after, said = quantities(score), quantities(found.scores[name])
             ratios = [
-                {x: float(np.log(new[x] / old[x])) for x in new}
+                {x: log_ratio(new[x], old[x]) for x in new}
                 for new, old in ((said, foretold_before), (after, before))
             ]
             labels = case.robot, case.engine, case.traj, case.world, case.seed

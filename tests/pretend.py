@@ -183,3 +183,29 @@ def tuning_of(history, weights=None, stop=Stop.LIMIT):
     weights = last.weights if weights is None else weights
     precision = np.outer(direction, direction) + 0.01 * np.eye(len(direction))
     return Tuning(weights, last.evaluation.loss, precision, np.array(stop), stack(history))
+
+
+def walking_program(off, height):
+    """Text of a walker, `off` to the left [m]; what writes its log comes after."""
+    return _WALKER.replace("OFF", off).replace("HEIGHT", str(height))
+
+
+_WALKER = """import json, sys
+import numpy as np
+request = json.load(open(sys.argv[1]))
+count = round(request["seconds"] / 0.005)
+t = 0.005 * np.arange(1, count + 1)[:, None]
+velocity = np.array([*request["command"]["velocity"][0], 0.0])
+off = OFF
+start = np.array([0.0, 0.0, HEIGHT])
+log = {
+    "period": 0.005,
+    "joints": 1e-6 * np.sin(t) * np.ones(10),
+    "initial.position": start,
+    "state.position": start + t * velocity + [0.0, off, 0.0],
+    "command.force": np.full((count, 2, 3), 10.0),
+    "command.moment": np.zeros((count, 2, 3)),
+}
+for name in ("euler", "ang_velocity", "velocity"):
+    log["initial." + name], log["state." + name] = np.zeros(3), np.zeros((count, 3))
+"""

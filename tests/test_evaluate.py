@@ -256,10 +256,10 @@ def test_plants_stop_to_walk_when_every_set_is_clear_and_go_on_later(
 ):
     words = "evaluate", "--traj", "s", "--seeds", 32, "--processes", 5, "--out", tmp_path
     assert call(monkeypatch, *words, "--until-clear") == 0
-    assert [job.seed for _, job in walked.jobs] == [seed for seed in range(6) for _ in range(2)]
+    assert [job.seed for _, job in walked.jobs] == [seed for seed in range(8) for _ in range(2)]
     told, err = capsys.readouterr()
-    line = "MuJoCo C, after 6 of at most 32 plants, against nominal: expert worse. "
-    line += "Saved 52 of 64 walks."
+    line = "MuJoCo C, after 8 of at most 32 plants, against nominal: expert worse. "
+    line += "Saved 48 of 64 walks."
     assert told.splitlines()[-1] == line
     assert "at most 64 walks: 2 on each plant" in err
     page = (tmp_path / "report.md").read_text()
@@ -268,10 +268,10 @@ def test_plants_stop_to_walk_when_every_set_is_clear_and_go_on_later(
     (stop,) = json.loads((tmp_path / "verdict.json").read_text())["stopping"]
     assert stop == {
         **C._asdict(),
-        "plants": 6,
+        "plants": 8,
         "most_plants": 32,
-        "walks": 12,
-        "walks_saved": 52,
+        "walks": 16,
+        "walks_saved": 48,
         "claims": {"s": {"expert": "worse"}},
     }
     assert call(monkeypatch, *words) == 0
@@ -283,13 +283,13 @@ def test_plants_stop_to_walk_when_every_set_is_clear_and_go_on_later(
 
 
 def test_each_engine_and_model_stops_where_it_is_clear(monkeypatch, capsys, walked):
-    words = "evaluate", "--traj", "s", "c", "--plant", "heavy", "--other-seeds", 16, "--json"
-    assert call(monkeypatch, *words, "--seeds", 12, "--until-clear") == 0
+    words = "evaluate", "--traj", "s", "c", "--plant", "heavy", "--other-seeds", 20, "--json"
+    assert call(monkeypatch, *words, "--seeds", 16, "--until-clear") == 0
     result = json.loads(capsys.readouterr().out)
-    fewest = StoppingRule(claims=4).fewest
-    assert [len(one["seeds"]) for one in result["columns"]] == [fewest, fewest]
+    (first, *_) = StoppingRule(claims=4, batch=4).batches(16)
+    assert [len(one["seeds"]) for one in result["columns"]] == [first.stop, first.stop] == [12, 12]
     saved = [one["walks_saved"] for one in result["stopping"]]
-    assert saved == [4 * (12 - fewest), 4 * (16 - fewest)]
+    assert saved == [4 * (16 - 12), 4 * (20 - 12)]
     assert len(result["claims"][1].split("; on c expert ")) == 2
 
 

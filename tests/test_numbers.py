@@ -7,8 +7,8 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from model import AHEAD, ANCHOR, BRIEF, PLAIN, ROBOT
-from pretend import call, refused
+from model import AHEAD, ANCHOR, BRIEF, HEIGHT, PLAIN, ROBOT
+from pretend import call, refused, walking_program
 
 from hector_jax.control.controller import walk_config
 from hector_jax.control.parameters import gradient_by_steps, nudged, numbers_of
@@ -110,9 +110,15 @@ def test_this_controller_has_no_such_number(tmp_path, monkeypatch, capsys):
     (tmp_path / "hector.xml").write_bytes(ROBOT.description.model.read_bytes())
     path = tmp_path / "mine.toml"
     path.write_text('model = "hector.xml"\n[numbers.KP]\nstart = 60\nlow = 10\nhigh = 300\n')
+    save_weights(weights := tmp_path / "w.json", nominal(ROBOT))
     for line, told in (
         (("tune", "--robot", path), f"{path}: [numbers] are of a controller of your own"),
-        (("walk", "--robot", path), "KP is a number of a controller of your own"),
+        (("walk", "--robot", path), f"{path}: [numbers] are of a controller of your own"),
+        (("evaluate", "--robot", path), f"{path}: [numbers] are of a controller of your own"),
+        (
+            ("export", weights, "--robot", path),
+            "which is not exported, but they are to a file of yours: --into",
+        ),
         (
             ("propose", tmp_path, "--start", "nominal", "--robot", path),
             "KP need slopes by walks",
@@ -306,29 +312,6 @@ def test_a_number_of_the_plan_is_moved_in_the_calls():
 
 # From the command line
 
-PROGRAM = """
-import json, sys
-import numpy as np
-request = json.load(open(sys.argv[1]))
-count = round(request["seconds"] / 0.005)
-t = 0.005 * np.arange(1, count + 1)[:, None]
-kp = request["weights"]["others"]["KP"]
-off = 0.01 * np.log(kp / 60.0) + 0.002
-velocity = np.array([*request["command"]["velocity"][0], 0.0])
-start = np.array([0.0, 0.0, %s])
-log = {
-    "period": 0.005,
-    "joints": 1e-6 * np.sin(t) * np.ones(10),
-    "initial.position": start,
-    "state.position": start + t * velocity + [0.0, off, 0.0],
-    "command.force": np.full((count, 2, 3), 10.0),
-    "command.moment": np.zeros((count, 2, 3)),
-}
-for name in ("euler", "ang_velocity", "velocity"):
-    log["initial." + name], log["state." + name] = np.zeros(3), np.zeros((count, 3))
-np.savez(sys.argv[2], **log)
-"""
-
 
 @pytest.mark.slow  # the model of a walk of 4 s is compiled
 def test_hector_tune_finds_a_number_by_walks(tmp_path, monkeypatch, capsys):
@@ -336,7 +319,8 @@ def test_hector_tune_finds_a_number_by_walks(tmp_path, monkeypatch, capsys):
     robot, walker = tmp_path / "mine.toml", tmp_path / "mine.py"
     number = "[numbers.KP]\nstart = 40\nlow = 10\nhigh = 300\nscale = 'log'\n"
     robot.write_text(f"name = 'mine'\nmodel = 'hector.xml'\n{number}")
-    walker.write_text(PROGRAM % float(ROBOT.standing_height))
+    off = '0.01 * np.log(request["weights"]["others"]["KP"] / 60.0) + 0.002'
+    walker.write_text(walking_program(off, HEIGHT) + "np.savez(sys.argv[2], **log)\n")
     line = ("tune", "--walker", walker, "--robot", robot, "--walks", 12, "--seeds", 1)
     assert call(monkeypatch, *line, "--out", tmp_path / "run", "--json") == 0
     out, err = capsys.readouterr()

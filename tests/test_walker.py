@@ -16,7 +16,7 @@ import jax
 import numpy as np
 import pytest
 from model import AHEAD, HEIGHT, ROBOT, ROOT
-from pretend import USUAL, call
+from pretend import USUAL, call, walking_program
 
 from hector_jax.control.controller import walk_config
 from hector_jax.control.weights import expert, nominal
@@ -33,33 +33,14 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
 
 CONFIG, SECONDS, PERIOD = walk_config(ROBOT), 0.1, 0.005
-# It follows the command, off to the left by 1 cm for each e-fold of Q_y from 500.
-PROGRAM = """
-import json, sys
-import numpy as np
-request = json.load(open(sys.argv[1]))
-count = round(request["seconds"] / 0.005)
-t = 0.005 * np.arange(1, count + 1)[:, None]
-velocity = np.array([*request["command"]["velocity"][0], 0.0])
-off = 0.01 * np.log(request["weights"]["Q"]["position"][1] / 500.0)
-start = np.array([0.0, 0.0, %s])
-log = {
-    "period": 0.005,
-    "joints": 1e-6 * np.sin(t) * np.ones(10),
-    "initial.position": start,
-    "state.position": start + t * velocity + [0.0, off, 0.0],
-    "command.force": np.full((count, 2, 3), 10.0),
-    "command.moment": np.zeros((count, 2, 3)),
-}
-for name in ("euler", "ang_velocity", "velocity"):
-    log["initial." + name], log["state." + name] = np.zeros(3), np.zeros((count, 3))
-"""
+# off to the left by 1 cm for each e-fold of Q_y from 500
+PROGRAM = walking_program('0.01 * np.log(request["weights"]["Q"]["position"][1] / 500.0)', HEIGHT)
 WRITE = "np.savez(sys.argv[2], **log)\n"
 
 
 def program(folder, text=WRITE):
     path = folder / "mine.py"
-    path.write_text(PROGRAM % HEIGHT + text)
+    path.write_text(PROGRAM + text)
     return path
 
 

@@ -15,6 +15,7 @@ from hector_jax.cli.flags import (
     Check,
     Collect,
     Evaluate,
+    Foretell,
     Train,
     Tune,
     View,
@@ -85,6 +86,13 @@ def planner_of(args: ByPlanner) -> Program | None:
         return None
     settings = args if isinstance(args, ByWalker) else ByWalker()
     return program_of(args.planner, settings.walker_limit, settings.walker_uses)
+
+
+def require_walker(args: ByWalker, robot: Robot) -> None:
+    """Raise an InputError for a robot with numbers of another controller, without a --walker."""
+    if robot.description.numbers and args.walker is None:
+        text = "[numbers] are of a controller of your own, which walks with --walker"
+        raise InputError(f"{robot.description.path}: {text}")
 
 
 def own_numbers(args: ByPlanner, robot: Robot) -> tuple[Tunable, ...]:
@@ -243,7 +251,9 @@ def load_trajectories(texts: Sequence[str], robot: Robot) -> tuple[NamedCommand,
     return loaded
 
 
-def walk_seconds(args: Check | Evaluate | Walk | View, trajectory: NamedCommand) -> float:
+def walk_seconds(
+    args: Check | Evaluate | Foretell | Walk | View, trajectory: NamedCommand
+) -> float:
     """Return the length of a walk [s]: from the trajectory's file if it has one, else --seconds.
 
     Raises:
@@ -259,11 +269,11 @@ def walk_seconds(args: Check | Evaluate | Walk | View, trajectory: NamedCommand)
     return trajectory.seconds
 
 
-def with_length(config: TuneConfig, trajectory: NamedCommand) -> TuneConfig:
-    """Return the tuning with rollouts as long as the trajectory, if its file sets a length."""
-    if trajectory.seconds is None:
+def with_length(config: TuneConfig, seconds: float | None) -> TuneConfig:
+    """Return the tuning with rollouts of this length [s]; None, as of a trajectory: unchanged."""
+    if seconds is None:
         return config
-    ticks = round(trajectory.seconds / config.rollout.walk.gait.tick)
+    ticks = round(seconds / config.rollout.walk.gait.tick)
     return replace(config, rollout=replace(config.rollout, ticks=ticks))
 
 

@@ -165,6 +165,8 @@ def run_export(args: flags.Export) -> None:
     run = Run(args.run) if args.run.is_dir() else None
     path = run.weights_file(args.set) if run else args.run
     folder = args.out or (args.run if run else args.run.parent) / "export"
+    if args.template and args.into:
+        raise InputError("--template and --into: only one can be given")
     if args.template or args.into:
         out = _fill_in(args, folder, path, load_robot(args.robot or (run and run.robot_file)))
         print_result(args.json, {"file": str(out)}, lambda: None)
@@ -177,6 +179,11 @@ def run_export(args: flags.Export) -> None:
     trajectory = arguments.load_trajectory(text, robot)
     name = f"{args.run.resolve().name}/{path.stem}" if run else path.stem
     weights = arguments.weights_by_name(str(path), robot)
+    if robot.description.numbers:
+        text = "[numbers] are of a controller of your own, which is not exported"
+        raise InputError(
+            f"{robot.description.path}: {text}, but they are to a file of yours: --into"
+        )
     say("exporting the controller and comparing it with the live one on a walk")
     with locked(folder):
         card = export.export(
@@ -205,7 +212,10 @@ def _fill_in(args: flags.Export, folder: Path, weights_file: Path, robot: Robot)
     if args.template:
         write_file(out, fill_template(source, weights).encode())
         return out
-    text = with_weights(source, read_own(source), weights_tree(weights))
+    numbers = [f"others.{number}" for number, _ in robot.description.numbers]
+    text, lacking = with_weights(source, read_own(source), weights_tree(weights), numbers)
+    if lacking:
+        say(f"{source} has no {', '.join(lacking)}: write these where your legs read them")
     write_file(out, text.encode(errors="surrogateescape"))
     if keys := keys_file(source):  # with which the copy is read
         write_file(folder / keys.name, keys.read_bytes())

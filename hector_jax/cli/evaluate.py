@@ -4,7 +4,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import fields
 from functools import partial
-from math import ceil
 from pathlib import Path
 from typing import NamedTuple, get_args
 
@@ -42,6 +41,8 @@ from hector_jax.store.setup import Setup
 from hector_jax.verdict import judging
 from hector_jax.verdict.matrix import OWN, Column, Columns, cells_of
 from hector_jax.verdict.stopping import StoppingRule
+
+_BATCH = 4  # plants between two looks of --until-clear: where it stops is no matter of the machine
 
 
 class PlantModel(NamedTuple):
@@ -121,6 +122,7 @@ def plan_of(args: Evaluate) -> EvaluationPlan:
         InputError: one line with the flag or the file.
     """
     robot = load_robot(args.robot)
+    arguments.require_walker(args, robot)
     trajectories = {}
     for name, text in arguments.trajectories_by_name(args.traj).items():
         trajectory = arguments.load_trajectory(text, robot)
@@ -229,7 +231,7 @@ def _rule(
     """
     per_plant = sum(map(len, sets.values()))
     claims = (per_plant - len(sets)) * len(columns)  # none about nominal
-    rule = StoppingRule(claims, batch=ceil(args.processes / per_plant))
+    rule = StoppingRule(claims, batch=_BATCH)
     for column, seeds in columns.items():
         if len(seeds) < rule.fewest:
             needs = (

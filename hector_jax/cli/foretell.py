@@ -46,7 +46,8 @@ def run_foretell(args: Foretell) -> None:
     """Foretell the walks of weight sets on the robot of some logs."""
     robot = load_robot(args.robot)
     trajectory = arguments.load_trajectory(args.traj, robot)
-    config = arguments.with_length(tunings.tune_config(robot), trajectory)
+    seconds = arguments.walk_seconds(args, trajectory)
+    config = arguments.with_length(tunings.tune_config(robot), seconds)
     walked = arguments.weights_by_name(args.walked, robot)
     names = arguments.short_names(args.weights)
     sets = {names[text]: arguments.weights_by_name(text, robot) for text in args.weights}
@@ -96,7 +97,8 @@ def _is_ours(path: Path) -> bool:
 
 def _mean(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Return geometric means of the quantities of some walks."""
-    return {name: float(np.exp(np.mean([np.log(row[name]) for row in rows]))) for name in rows[0]}
+    with np.errstate(divide="ignore"):  # a quantity may be zero
+        return {n: float(np.exp(np.mean([np.log(row[n]) for row in rows]))) for n in rows[0]}
 
 
 def _set_result(
@@ -105,7 +107,12 @@ def _set_result(
     """Return what logs foretell of a set as JSON values: each quantity, its change, its margins."""
     each = [forecast(one, name, group) for one in found]
     tilts, heights = zip(*(one.margins[name] for one in found), strict=True)
-    result: dict[str, Any] = {"tilt": max(tilts), "height_over_limit": min(heights)}
+    falls = any(bool(one.scores[name].fallen) for one in found)
+    result: dict[str, Any] = {
+        "falls": falls,
+        "tilt": max(tilts),
+        "height_over_limit": min(heights),
+    }
     for quantity in each[0]:
         ratio = np.mean([one[quantity] for one in each], axis=0)  # with the ends of its interval
         value, change = logged[quantity] * np.exp(ratio), 100.0 * np.expm1(ratio)
@@ -136,6 +143,9 @@ def _lines(result: Mapping[str, Any], logs: int) -> Iterator[str]:
     if logs > 1:
         yield f"means of {logs} logs"
     for name, row in result["sets"].items():
+        if row["falls"]:
+            yield f"{name} falls in its foretold walk: the numbers of its row are no forecast"
+            continue
         tilt, height = 100 * row["tilt"], row["height_over_limit"]
         text = f"its foretold walk tilts to {tilt:.0f} % of a fall's angle, the trunk stays at"
         yield f"falls of {name} are not foretold; {text} {height:.1f} times a fall's height"

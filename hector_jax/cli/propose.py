@@ -170,7 +170,7 @@ def _campaign(args: Propose) -> Campaign:
     robot = jax.tree.map(np.asarray, load_robot(args.robot))
     trajectories = arguments.load_trajectories(args.traj, robot)
     config = best_set.on_walks(tunings.tune_config(robot, others=tunables(args.tune)))
-    config = arguments.with_length(config, trajectories[0])
+    config = arguments.with_length(config, trajectories[0].seconds)
     begun = (args.folder / CONFIG).exists()  # from weights that --start may no longer name
     start = str(walks.weights_path(args.folder, 0)) if begun else args.start
     start = arguments.weights_by_name(start, robot)

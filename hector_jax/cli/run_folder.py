@@ -82,9 +82,7 @@ def _check_walker(args: Tune, robot: Robot) -> None:
     if args.walker is None:
         if args.planner:
             raise InputError("--planner plans for the walks of a --walker, which is not given")
-        if robot.description.numbers:
-            text = "[numbers] are of a controller of your own, which walks with --walker"
-            raise InputError(f"{robot.description.path}: {text}")
+        arguments.require_walker(args, robot)
         return
     if not args.walks:
         raise InputError("--walker needs --walks, the number of its walks that a tuning may take")

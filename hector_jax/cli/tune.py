@@ -123,7 +123,7 @@ def _begin(pool: Executor, folder: Path, args: Tune) -> _Run:
     robot = load_robot(args.robot)
     trajectories = run_folder.trajectories(args, robot)
     config = tunings.tune_config(robot, iterations=args.iterations, others=tunables(args.tune))
-    config = arguments.with_length(config, trajectories[0])
+    config = arguments.with_length(config, trajectories[0].seconds)
     start = arguments.weights_by_name(args.start, robot)
     return _Run(Setup(pool, config, robot), folder, args, start, trajectories)
 

@@ -63,6 +63,7 @@ def run_walk(args: Walk) -> None:
     robot = arguments.with_gait(load_robot(args.robot), args.gait)
     plant = arguments.load_plant(args.plant, robot) if args.plant else None
     _check_world(args)
+    arguments.require_walker(args, robot)
     engine, weights = arguments.engine_of(args), arguments.weights_by_name(args.weights, robot)
     command = arguments.load_trajectory(args.traj, robot)
     loss, config = loss_of_robot(robot.description), walk_config(robot)

@@ -152,7 +152,7 @@ def tune_walker(folder: Path, args: Tune) -> None:
     robot = load_robot(args.robot)
     trajectories = run_folder.trajectories(args, robot)
     config = tunings.tune_config(robot, others=arguments.own_numbers(args, robot))
-    config = arguments.with_length(config, trajectories[0])
+    config = arguments.with_length(config, trajectories[0].seconds)
     campaign = _campaign(folder, args, config, robot, trajectories)
     commands, seconds = campaign.commands, campaign.seconds
     _check_first(args, campaign, seconds)

@@ -14,7 +14,7 @@ each number.
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from decimal import Decimal, localcontext
 from fractions import Fraction
 from pathlib import Path
@@ -103,8 +103,10 @@ def tagged_weights(path: Path, text: str, entries: Entries) -> dict[str, dict[st
     return tree
 
 
-def with_weights(path: Path, text: str, tree: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the text of a file with other weights.
+def with_weights(
+    path: Path, text: str, tree: Mapping[str, Mapping[str, Any]], optional: Collection[str] = ()
+) -> tuple[str, list[str]]:
+    """Return the text of a file with other weights, and those of the `optional` that it has not.
 
     Only digits of tagged numbers change, of those whose weight is another: `tagged_weights` of the
     text are exactly these.
@@ -112,6 +114,7 @@ def with_weights(path: Path, text: str, tree: Mapping[str, Mapping[str, Any]]) -
     Args:
         path, text: the file.
         tree: of `weights_file.weights_tree`.
+        optional: entries that may be without a tag, such as `others.KP`.
 
     Raises:
         InputError: one line, as of `tagged_weights`; or a number is of weights that differ.
@@ -129,10 +132,11 @@ def with_weights(path: Path, text: str, tree: Mapping[str, Mapping[str, Any]]) -
             number = _digits(weight, place.factor)
         parts += [text[end : place.span[0]], number]
         end = place.span[1]
+    lacking = [name for name, absent in left.items() if name in optional and absent.all()]
     for name, absent in left.items():
-        if absent.any():
+        if absent.any() and name not in lacking:
             raise InputError(f"{path}: no tag has {name}{_indices(np.argwhere(absent)[0])}")
-    return "".join([*parts, text[end:]])
+    return "".join([*parts, text[end:]]), lacking
 
 
 def _indices(index: Any) -> str:

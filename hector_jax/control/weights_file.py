@@ -1,6 +1,7 @@
 """Weights in files: JSON, and tagged numbers of another program."""
 
 import json
+import re
 from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hector_jax.control.parameters import COST, TUNABLES, numbers_of, tunable
-from hector_jax.control.tagged_file import is_tagged, read_own, tagged_weights
+from hector_jax.control.tagged_file import is_tagged, keys_file, read_own, tagged_weights
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, unknown
@@ -82,7 +83,10 @@ def load_weights(path: Path, robot: Robot | None = None) -> Weights:
         for part in ("Q", "R")
     }
     if is_tagged(path, text := read_own(path)):
-        known = {**parts, "others": _others(TUNABLES, robot)}
+        keys = keys_file(path)
+        tags = read_own(keys) if keys else text
+        costs = set(re.findall(rf"\bothers\.({COST}\w+)", tags))
+        known = {**parts, "others": _others((*TUNABLES, *costs), robot)}
         entries = {f"{part}.{n}": x for part, named in known.items() for n, x in named.items()}
         tree = tagged_weights(path, text, entries)
     elif path.suffix == ".json" or text.lstrip().startswith("{"):

@@ -185,13 +185,6 @@ class Run:
         raise InputError(f"{self.folder} has no weight set {name!r}; it has {', '.join(names)}")
 
 
-def robot_file(folder: Path) -> Path | None:
-    """Return the file of the robot of a run, also of one with walks of the user's; None: HECTOR."""
-    flags = read_object(folder / CONFIG).get("flags")
-    robot = flags.get("robot") if isinstance(flags, dict) else None
-    return robot and Path(robot)
-
-
 def as_row(name: str, iteration: Iteration) -> dict[str, Any]:
     """Return an iteration as a row of metrics.jsonl, for `Run.histories`."""
     evaluation = iteration.evaluation

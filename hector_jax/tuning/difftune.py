@@ -98,7 +98,9 @@ def _why_not_tunable(walk: WalkConfig, name: str) -> str:
     if name in ("position_limit", "yaw_limit", "integral_limit"):
         return (
             f"{name} cannot be tuned by gradients: what it limits is mostly below it in rollouts, "
-            "so that its gradient is mostly zero; a weights file or --safe can set it"
+            "so that its gradient is mostly zero; a weights file can set it"
+            + " and so does --safe"
+            * (name == "position_limit")
         )
     if tunable.path.startswith("footstep.") and walk.footstep.rule == "paper":
         return f"{name} has no part in the paper's rule"

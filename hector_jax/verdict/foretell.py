@@ -16,7 +16,14 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.control.parameters import steps_between
+from hector_jax.control.controller import WalkConfig
+from hector_jax.control.parameters import (
+    is_ours,
+    numbers_of,
+    steps_between,
+    tunable,
+    without_numbers,
+)
 from hector_jax.control.reference import Command, standing_anchor
 from hector_jax.control.weights import Weights
 from hector_jax.core.inputs import InputError
@@ -45,7 +52,7 @@ HERE, ELSEWHERE = "here", "elsewhere"
 class Foretold(NamedTuple):
     """Walks that a log foretells."""
 
-    scores: dict[str, Score]  # by set
+    scores: dict[str, Score]  # by set; of a walk that falls it says no more than that
     margins: dict[str, tuple[float, float]]  # by set: largest tilt and lowest height, see `margin`
     walked: Score  # of the log, as the grounded rollout repeats it
     distances: dict[str, float]  # of the weights from those of the log, see `distance`
@@ -61,7 +68,7 @@ def quantities(score: Score) -> dict[str, float]:
 
 
 def distance(walked: Weights, weights: Weights) -> float:
-    """Return the root mean square of the logarithms of the ratios of Q and R."""
+    """Return the root mean square of the logarithms of the ratios of the directions of Q and R."""
     return float(np.sqrt(np.mean(np.square(steps_between(walked, weights)))))
 
 
@@ -86,28 +93,53 @@ def foretell(
         call: plans of a controller that is known by calling it.
 
     Raises:
-        InputError: the robot fell in the log; or a plan of a foretold walk is not solved.
+        InputError: the robot fell in the log; a plan of a foretold walk is not solved; or a set has
+            another value of a number that the rigid body does not have.
     """
+    controller = config.rollout.walk
     if log.fallen.any():
         raise InputError("the robot fell in the log: it foretells nothing")
-    scenario = Scenario(
-        robot, command, standing_anchor(robot), network.effect_of(None, config.rollout.walk)
-    )
+    whole = _completed(controller, {"": walked, **sets})
+    planned = {x.name for x in numbers_of(robot.description) if not x.of_legs and call is not None}
+    for name, weights in whole.items():
+        if unknown := [x for x in _differing(whole[""], weights) if not _is_felt(x, planned)]:
+            text = f"{', '.join(unknown)} differs from that of the log, but no plan depends on it"
+            raise InputError(f"{name}: {text}: only a walk can tell what it brings")
+    effect = network.effect_of(None, controller)
+    scenario = Scenario(robot, command, standing_anchor(robot), effect)
     walk, called = trajectory_of(log), None
     if call is not None:
-        inputs = plan_inputs(config.rollout.walk, robot, walked, command, walk)
-        called = called_plans(call, config.rollout.walk, inputs)
-    grounding = fit_grounding(config.rollout, scenario, walked, walk, called=called)
+        inputs = plan_inputs(controller, robot, walked, command, walk)
+        numbers = [x for x in numbers_of(robot.description) if x.name in planned]
+        called = called_plans(call, controller, inputs, numbers)
+    grounding = fit_grounding(config.rollout, scenario, whole[""], walk, called=called)
     scores, margins, limits = {}, {}, robot.description.limits
-    for name, weights in {"": walked, **sets}.items():
-        full = weights._replace(others={**walked.others, **weights.others})
-        found = jax.device_get(_rollout(config.rollout, grounding, full))
+    for name, weights in whole.items():
+        found = jax.device_get(_rollout(config.rollout, grounding, weights))
         if not np.max(found.residual) <= SOLVED:
             raise InputError(f"{name or 'the log'}: a plan of the foretold walk is not solved")
         scores[name] = metrics.score(config.loss, found)
         margins[name] = margin(limits, found.state.euler, found.state.position)
     away = {name: distance(walked, weights) for name, weights in sets.items()}
     return Foretold(scores, margins, scores.pop(""), away)
+
+
+def _completed(controller: WalkConfig, sets: Mapping[str, Weights]) -> dict[str, Weights]:
+    """Return sets with the same numbers: ours that one lacks are those of the controller."""
+    ours = {name for x in sets.values() for name in without_numbers(x).others}
+    return {name: controller.with_others(x, sorted(ours)) for name, x in sets.items()}
+
+
+def _differing(walked: Weights, weights: Weights) -> list[str]:
+    """Return the names of the numbers of a set that are not those of the log."""
+    names = {*walked.others, *weights.others}
+    values = {x: [w.others.get(x, np.nan) for w in (walked, weights)] for x in sorted(names)}
+    return [name for name, (one, other) in values.items() if not np.array_equal(one, other)]
+
+
+def _is_felt(name: str, planned: set[str]) -> bool:
+    """Tell whether a foretold walk depends on a number."""
+    return not tunable(name).of_legs if is_ours(name) else name in planned
 
 
 _rollout = partial(jax.jit, static_argnums=0)(grounded_rollout)
@@ -163,6 +195,10 @@ def forecast(foretold: Foretold, name: str, group: str) -> dict[str, Interval]:
         name: of the set.
         group: HERE or ELSEWHERE.
 
+    Returns:
+        By quantity; NaN in place of the ends if the foretold walk falls, and for all of one that is
+        zero in a walk.
+
     Raises:
         InputError: the weights are farther from those of the log than any that was measured.
     """
@@ -171,5 +207,11 @@ def forecast(foretold: Foretold, name: str, group: str) -> dict[str, Interval]:
         text = f"forecasts were measured up to {np.exp(farthest):.1f} times"
         raise InputError(f"{name}: {np.exp(far):.1f} times the weights of the log (RMS); {text}")
     before, after = quantities(foretold.walked), quantities(foretold.scores[name])
-    ratios = {x: float(np.log(after[x] / before[x])) for x in after}
-    return {x: interval(ratio, calibrated(group).get(x, [])) for x, ratio in ratios.items()}
+    falls, pairs = bool(foretold.scores[name].fallen), calibrated(group)
+    ratios = {x: log_ratio(after[x], before[x]) for x in after}
+    return {x: interval(r, [] if falls else pairs.get(x, [])) for x, r in ratios.items()}
+
+
+def log_ratio(after: float, before: float) -> float:
+    """Return the logarithm of a ratio; NaN if one of both is zero."""
+    return float(np.log(after / before)) if after > 0.0 and before > 0.0 else float("nan")
