@@ -31,6 +31,7 @@ from hector_jax.control.weights_file import best
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.sim.margin import delay_lines
 from hector_jax.store.nets import CollectConfig
+from hector_jax.verdict import foretell
 from hector_jax.walk_tuning import best_set
 from hector_jax.walk_tuning.starts import START_PLANTS
 
@@ -573,6 +574,11 @@ def other_pages():
     of_two = found["with --walk-plants 2"]["trajectories"]
     assert {name: of["best"]["falls"] for name, of in of_two.items()} == {"straight": 0, "s": 3}
     yield DOCS / "howto" / "own.md", "With `--walk-plants 2` three fell on s."
+    pairs, known = report("foretell/standin.json")["pairs"], foretell.calibrated(foretell.HERE)["L"]
+    ends = [(foretell.interval(x["foretold"]["L"], known), x["walked"]["L"]) for x in pairs]
+    held = sum(low <= came <= high for (_, low, high), came in ends)
+    text = f"{held} of {len(pairs)} held what came, of {0.9 * len(pairs):.0f} that should"
+    yield DOCS / "howto" / "walks.md", text
     notes, walks = ROOT / "experiments" / "notes.md", report("many-plants/walks.json")["L"]
     best_of_then, searched = (np.array([*walks[name].values()]) for name in ("best", "search"))
     lower = -100 * np.expm1(np.log(searched / best_of_then).mean(axis=1))

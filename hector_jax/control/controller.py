@@ -7,7 +7,7 @@ robot, never the parameters of the plant.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -232,10 +232,8 @@ def limit_errors(
     shift = away * (jnp.maximum(distance - position, 0.0) / distance)
     error = state.euler[2] - reference.euler[2]
     wanted = horizon.reference
-    moved = wanted._replace(
-        position=wanted.position + shift,
-        euler=wanted.euler.at[:, 2].add(error - jnp.clip(error, -yaw, yaw)),
-    )
+    euler = wanted.euler.at[:, 2].add(error - jnp.clip(error, -yaw, yaw))
+    moved = wanted._replace(position=wanted.position + shift, euler=euler)
     return horizon._replace(reference=moved)
 
 
@@ -293,8 +291,8 @@ def plan(
     solve = partial(solve_mpc, config.mpc, problem, dt=config.mpc_step, max_contacts=max_contacts)
     held = last is not None and every > 1
     wrench, solution = _solve_or_keep(solve, last, tick % every == 0) if held else solve()
-    residual = jnp.maximum(solution.primal_residual, solution.dual_residual)
-    residual = jnp.maximum(residual, solution.gap)
+    residuals = solution.primal_residual, solution.dual_residual, solution.gap
+    residual = reduce(jnp.maximum, residuals)
     if config.twin != TwinConfig():  # a foot in the air exerts nothing
         wrench = jax.tree.map(lambda x: contact[:, None] * x, wrench)
     return Plan(wrench, contact, touchdown, swing_ticks, residual, solution.status, disturbance)
