@@ -166,7 +166,11 @@ def calibration(pairs: Sequence[Pair]) -> dict[str, Any]:
             group: {
                 "farthest": max((p.far for p in found), default=0.0),
                 "pairs": {
-                    name: [[round(p.foretold[name], 4), round(p.walked[name], 4)] for p in found]
+                    name: [
+                        [round(p.foretold[name], 4), round(p.walked[name], 4)]
+                        for p in found
+                        if np.isfinite(p.foretold[name] + p.walked[name])
+                    ]
                     for name in (found[0].walked if found else ())
                 },
             }
