@@ -33,7 +33,7 @@ SMALL = {
     "view": "--out shown",
 }
 """Flags that make a line of a command small, in the place of its own."""
-SECONDS = {"walk": 0.2, "evaluate": 0.2, "check": 1.5, "twin": 1.5}
+SECONDS = {"walk": 0.2, "evaluate": 0.2, "check": 1.5, "twin": 1.5, "foretell": 1.5}
 """Lengths of the walks of a command; those of others are as long as a trajectory's file says."""
 ELSEWHERE = ("--cluster", "--help", "doctor")  # a scheduler; no work; the machine's
 
@@ -114,12 +114,15 @@ PAIRS = [
 """Lines of flags that meet in the code, in an order in which each has its input."""
 PROPOSED = "hector propose runs/robot --traj s"
 PROPOSED_WALK = "hector walk --weights runs/robot/weights/0.json --traj s --out {}"
+A_WALK = "hector walk --weights nominal --traj {} --seconds 1.5 --out {}.npz"
 INPUTS = {
     "hector log add runs/robot log.npz": [PROPOSED, PROPOSED_WALK.format("log.npz")],
     "hector log add runs/robot s.npz": [PROPOSED, PROPOSED_WALK.format("s.npz")],
-    "hector log check mine.npz --traj straight": [
-        "hector walk --traj straight --seconds 1.5 --out mine.npz"
+    "hector log check mine.npz --traj straight": [A_WALK.format("straight", "mine")],
+    "hector log foretell mine.npz --walked nominal --weights expert best": [
+        A_WALK.format("straight", "mine")
     ],
+    "hector log foretell s.npz --traj s --walked nominal --weights best": [A_WALK.format("s", "s")],
     "hector evaluate --walker mine.py --robot mine.toml --traj c --weights mine.json best.json": [
         "hector walk --walker mine.py --robot mine.toml --out log.npz"
     ],

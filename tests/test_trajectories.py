@@ -76,8 +76,8 @@ def test_the_example_is_a_command_of_six_seconds_that_ends_as_it_began_and_rollo
     end = reference_at(0.01, found.command, standing_anchor(ROBOT), 600.0)
     assert end.euler[2] == pytest.approx(0.0, abs=1e-9)
     config = TuneConfig()
-    assert arguments.with_length(config, found).rollout.ticks == 600
-    assert arguments.with_length(config, command_of("c")) == config
+    assert arguments.with_length(config, found.seconds).rollout.ticks == 600
+    assert arguments.with_length(config, command_of("c").seconds) == config
 
 
 @pytest.mark.slow
