@@ -45,7 +45,7 @@ def test_cells_below_and_clear_and_void_are_counted():
     mixed.scores["with"].losses["L"][:3] *= 8.0  # the median stays below, the interval does not
     cells = {(C, "s"): cell(), (C, "c"): mixed, (HEAVY, "s"): cell(fallen=[("with", 1)])}
     cells[HEAVY, "c"] = cell(tuned=5e6)
-    assert matrix.tally(cells, "with", "nominal") == (4, 2, 1, 1, 1)
+    assert matrix.against(cells, "with", "nominal").tally == (4, 2, 1, 1, 1)
 
 
 def test_plants_are_the_sample_of_falls_over_engines_and_trajectories_and_intervals_are_exact():
@@ -84,7 +84,8 @@ def test_the_spread_is_between_engines_on_the_plants_that_both_have():
 def test_what_holds_everywhere_is_claimed_and_what_does_not_is_not():
     def claims(tuned):
         cells = {(C, "s"): cell(), (DRAKE, "s"): cell(tuned=tuned)}
-        return " ".join(sum(report.claims(cells, {}, "standin").values(), []))
+        told = report.claims(cells, matrix.judge_cells(cells), {}, "standin")
+        return " ".join(sum(told.values(), []))
 
     everywhere, in_one_engine = claims(1e6), claims(5e6)
     assert "below nominal in 2 of 2 cells, the interval clear of zero in 2." in everywhere
@@ -106,7 +107,7 @@ def test_the_report_has_a_page_its_numbers_and_a_picture(tmp_path, drawn):
     report.write_matrix_report(tmp_path, cells, result, "hector evaluate")
     page = (tmp_path / "report.md").read_text()
     assert "72 walks: `nominal`, `expert`, `with`, on 2 trajectories in 3 columns." in page
-    for line in sum(report.claims(cells, {}, "standin-even").values(), []):
+    for line in [*result["claims"], *result["limits"]]:
         assert f"- {line}\n" in page
     told = json.loads((tmp_path / "verdict.json").read_text())
     there, total = told["columns"][1]["trajectories"]["s"]["with"], told["sets"]["with"]

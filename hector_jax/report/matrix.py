@@ -13,7 +13,7 @@ from hector_jax.report import plots
 from hector_jax.report.report import Picture, change_text, markdown_table, render, seeds_text
 from hector_jax.sim.engine import ENGINES
 from hector_jax.verdict import matrix
-from hector_jax.verdict.matrix import OWN, Cells, Column, Columns
+from hector_jax.verdict.matrix import OWN, Cells, Column, Columns, Judgement
 from hector_jax.verdict.metrics import BASELINES, FEWEST, Interval, compare, fixed_rank
 from hector_jax.verdict.stopping import claims_of
 
@@ -43,45 +43,32 @@ def share_text(share: Interval) -> str:
     return f"{value} [{low}, {high}] %"
 
 
-def claims(cells: Cells, differs: Mapping[str, str], world: str) -> dict[str, list[str]]:
+def claims(
+    cells: Cells, judgement: Judgement, differs: Mapping[str, str], world: str
+) -> dict[str, list[str]]:
     """List the `claims` that the walks support, and their `limits`.
 
     Args:
         cells: the walks.
+        judgement: what they say.
         differs: differences of the plants in an engine from those in MuJoCo C, by its name.
         world: world of the plants.
     """
-    names = matrix.sets_of(cells)
-    pairs = [(n, b) for n in names for b in BASELINES if b in names and b != n]
-    pairs = [(n, b) for n, b in pairs if n not in BASELINES] or pairs[-1:]
-    seeds = {column: verdict.seeds for (column, _), verdict in cells.items()}
-    changes = {(n, b): matrix.changes_by_cell(cells, n, b) for n, b in pairs}
-    fill = partial(
-        render,
-        matrix=matrix,
-        cells=cells,
-        above={
-            pair: [cell for cell, c in row.items() if c.counts and c.change["L"].low > 0.0]
-            for pair, row in changes.items()
-        },
-        void={pair: [x for x, c in row.items() if not c.counts] for pair, row in changes.items()},
-        names=names,
-        pairs=pairs,
-        seeds=list(map(seeds_text, seeds.values())),
-        engines=list(dict.fromkeys(column.engine for column in seeds)),
-        models=list(dict.fromkeys(column.model for column in seeds)),
-        few=[c for c, drawn in seeds.items() if len(drawn) < FEWEST],
-        differs=differs,
-        world=world,
-        cell_text=cell_text,
-        share_text=share_text,
-        title_of=title_of,
-        ENGINES=TITLES,
-        LEARNED_FROM=LEARNED_FROM,
-        tuned=[name for name in names if name not in BASELINES],
-        fixed=all(verdict.rank is fixed_rank for verdict in cells.values()),
-    )
-    texts = {name: fill(f"{name}.txt.j2") for name in ("claims", "limits")}
+    verdicts = {column: verdict for (column, _), verdict in cells.items()}
+    engines = list(dict.fromkeys(column.engine for column in verdicts))
+    titles = {name: TITLES.get(name, name) for name in engines}
+    facts = {
+        "own_only": {column.model for column in verdicts} == {OWN},
+        "few": [title_of(c) for c, verdict in verdicts.items() if len(verdict.seeds) < FEWEST],
+        "seeds": list(dict.fromkeys(seeds_text(v.seeds) for v in verdicts.values())),
+        "learned_from": [titles[name] for name in engines if name in LEARNED_FROM],
+        "tuned": [name for name in judgement.falls if name not in BASELINES],
+        "stopped": any(verdict.rank is not fixed_rank for verdict in cells.values()),
+        "differs": {TITLES.get(name, name): text for name, text in differs.items()},
+    }
+    fill = partial(render, judgement=judgement, engines=list(titles.values()), world=world, **facts)
+    words = {"cell_text": cell_text, "share_text": share_text, "title_of": title_of}
+    texts = {name: fill(f"{name}.txt.j2", **words) for name in ("claims", "limits")}
     return {name: [x for x in text.splitlines() if x] for name, text in texts.items()}
 
 
@@ -127,8 +114,9 @@ def matrix_report(cells: Cells, differs: Mapping[str, str], world: str) -> dict[
         differs: differences of the plants in an engine from those in MuJoCo C, by its name.
         world: world of the plants.
     """
-    told = claims(cells, differs, world)
-    return matrix.matrix_result(cells, world) | {"differs": dict(differs), **told}
+    judgement = matrix.judge_cells(cells)
+    told = claims(cells, judgement, differs, world)
+    return matrix.matrix_result(cells, judgement, world) | {"differs": dict(differs), **told}
 
 
 def stopping_result(

@@ -18,9 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hector_jax.verdict import metrics
-from hector_jax.verdict.metrics import BASELINES, COVERAGE, Comparison, Interval, Verdict
+from hector_jax.verdict.metrics import BASELINES, COVERAGE, Interval, Verdict
 
 OWN = "own"  # the model of the robot's file
+LOWER, MAYBE_LOWER, NOT_LOWER = "lower", "maybe lower", "not lower"
+"""Claims about a set in all cells: every interval is below zero; every median is; neither."""
 FEWEST_SETS = 3  # for which Kendall's tau is computed
 
 
@@ -90,6 +92,47 @@ class Agreement(NamedTuple):
     tau: float  # Kendall's: 1 for the same order, -1 for the reverse one
 
 
+class Against(NamedTuple):
+    """What the walks say of a set against a baseline."""
+
+    tally: Tally
+    above: list[tuple[Column, str]]  # cells with the whole interval above zero
+    void: list[tuple[Column, str]]  # cells that falls make no comparison
+    worst: Worst
+    spreads: list[Spread]
+
+    @property
+    def claim(self) -> str:
+        """What may be said of all cells: LOWER, MAYBE_LOWER or NOT_LOWER."""
+        if self.tally.clear == self.tally.cells:
+            return LOWER
+        return MAYBE_LOWER if self.tally.below == self.tally.cells else NOT_LOWER
+
+    @property
+    def widest(self) -> Spread:
+        """The largest spread between engines; there is one where several engines walk."""
+        return sorted(self.spreads, key=lambda spread: spread.spread)[-1]
+
+    @property
+    def small(self) -> int:
+        """Number of trajectories and models in which the spread is small beside the gain."""
+        return sum(spread.is_small for spread in self.spreads)
+
+
+class Judgement(NamedTuple):
+    """What walks in several engines and models say, and of which sets it is told in words."""
+
+    against: dict[tuple[str, str], Against]  # by set and baseline
+    told: list[tuple[str, str]]  # the pairs of `against` that are told
+    falls: dict[str, Falls]  # by set
+    agreements: list[Agreement]
+
+    @property
+    def least(self) -> Agreement | None:
+        """The two columns that order the sets least alike; None for fewer than 3 sets."""
+        return min(self.agreements, key=lambda agreement: agreement.tau, default=None)
+
+
 def cells_of(columns: Columns) -> Cells:
     """Return the walks of each column on each trajectory."""
     return {(c, t): verdict.of_scene(t) for c, verdict in columns.items() for t in verdict.scenes}
@@ -110,22 +153,33 @@ def sets_of(cells: Cells) -> list[str]:
     return list(next(iter(cells.values())).scores)
 
 
-def changes_by_cell(cells: Cells, name: str, baseline: str) -> dict[tuple[Column, str], Comparison]:
-    """Compare a set with a baseline in every cell."""
-    return {cell: metrics.compare(verdict, name, baseline) for cell, verdict in cells.items()}
-
-
-def tally(cells: Cells, name: str, baseline: str) -> Tally:
-    """Count the cells in which a set is below a baseline."""
-    comparisons = changes_by_cell(cells, name, baseline).values()
-    intervals = [comparison.change["L"] for comparison in comparisons if comparison.counts]
-    return Tally(
-        cells=len(cells),
-        below=sum(interval.value < 0.0 for interval in intervals),
-        clear=sum(interval.high < 0.0 for interval in intervals),
-        above=sum(interval.low > 0.0 for interval in intervals),
-        void=len(cells) - len(intervals),
+def judge_cells(cells: Cells) -> Judgement:
+    """Judge every set against every baseline that has walked."""
+    names = sets_of(cells)
+    pairs = [(n, b) for n in names for b in BASELINES if b in names and b != n]
+    return Judgement(
+        {pair: against(cells, *pair) for pair in pairs},
+        [(n, b) for n, b in pairs if n not in BASELINES] or pairs[-1:],
+        {name: falls(cells, name) for name in names},
+        agreements(cells),
     )
+
+
+def against(cells: Cells, name: str, baseline: str) -> Against:
+    """Judge a set against a baseline."""
+    changes = {cell: metrics.compare(verdict, name, baseline) for cell, verdict in cells.items()}
+    intervals = {cell: c.change["L"] for cell, c in changes.items() if c.counts}
+    above = [cell for cell, interval in intervals.items() if interval.low > 0.0]
+    void = [cell for cell in cells if cell not in intervals]
+    tally = Tally(
+        cells=len(cells),
+        below=sum(interval.value < 0.0 for interval in intervals.values()),
+        clear=sum(interval.high < 0.0 for interval in intervals.values()),
+        above=len(above),
+        void=len(void),
+    )
+    differ = spreads(cells, name, baseline)
+    return Against(tally, above, void, worst(cells, name, baseline), differ)
 
 
 def falls(cells: Cells, name: str) -> Falls:
@@ -200,7 +254,7 @@ def _losses_on_shared_seeds(verdicts: Sequence[Verdict]) -> list[dict[str, np.nd
     return [{name: score.L[at] for name, score in v.scores.items()} for v, at in inputs]
 
 
-def matrix_result(cells: Cells, world: str) -> dict[str, Any]:
+def matrix_result(cells: Cells, judgement: Judgement, world: str) -> dict[str, Any]:
     """Return all columns as JSON values: `world` and what follows, of verdict.json.
 
     `columns` is a list of `engine`, `model`, `seeds` and `trajectories.<name>`, each as the `sets`
@@ -208,32 +262,21 @@ def matrix_result(cells: Cells, world: str) -> dict[str, Any]:
     `Falls` in all cells, `.against.<baseline>` the counts of cells, the worst plant and the
     spreads; `kendall` is a list of pairs of columns.
     """
-    names = sets_of(cells)
     columns: list[dict[str, Any]] = []
     for column in columns_of(cells):
         verdicts = {t: verdict for (c, t), verdict in cells.items() if c == column}
         seeds = next(iter(verdicts.values())).seeds.tolist()
         trajectories = {trajectory: _cell(verdict) for trajectory, verdict in verdicts.items()}
         columns.append({**column._asdict(), "seeds": seeds, "trajectories": trajectories})
-    sets = {}
-    for name in names:
-        against = {
-            baseline: {
-                **tally(cells, name, baseline)._asdict(),
-                "worst": _plain(worst(cells, name, baseline)),
-                "spread": [spread._asdict() for spread in spreads(cells, name, baseline)],
-            }
-            for baseline in BASELINES
-            if baseline in names and baseline != name
+    sets = {name: {**_plain(count), "against": {}} for name, count in judgement.falls.items()}
+    for (name, baseline), row in judgement.against.items():
+        sets[name]["against"][baseline] = {
+            **row.tally._asdict(),
+            "worst": _plain(row.worst),
+            "spread": [spread._asdict() for spread in row.spreads],
         }
-        sets[name] = {**_plain(falls(cells, name)), "against": against}
-    kendall = [_plain(agreement) for agreement in agreements(cells)]
-    return {
-        "world": world,
-        "columns": columns,
-        "sets": sets,
-        "kendall": kendall,
-    }
+    kendall = [_plain(agreement) for agreement in judgement.agreements]
+    return {"world": world, "columns": columns, "sets": sets, "kendall": kendall}
 
 
 def _cell(verdict: Verdict) -> dict[str, Any]:
