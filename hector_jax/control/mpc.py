@@ -109,8 +109,10 @@ class MpcConfig:
         integral = IntegralGains(*(getattr(self, name) for name in names))
         limit = math.inf if self.position_limit is None else self.position_limit
         costs = {str(cost): 1.0 for cost in self.costs}
-        forces = (self.friction, self.max_force, float(self.effort_reference == "gravity"))
-        return MpcParameters(weights, *forces, limit, self.yaw_limit, integral, costs)
+        gravity = float(self.effort_reference == "gravity")
+        return MpcParameters(
+            weights, self.friction, self.max_force, gravity, limit, self.yaw_limit, integral, costs
+        )
 
     def planned_inertia(self, inertia: Float[Any, "3 3"]) -> Float[Any, "3 3"]:
         """Return the inertia [kg m^2] that the plan turns, from that of the whole robot."""

@@ -64,9 +64,6 @@ def anchor_at(robot: Robot, state: State, start_tick: Int[Array, ""] | int) -> A
 COMMANDS = ("straight", "c", "s")
 """The paper's trajectories."""
 
-UNSEEN = ("sideways", "turn", "eight", "stop-and-go")
-"""Trajectories beyond the paper, to test weights that were tuned on others."""
-
 _QUARTER, _HALF = 0.25 * np.pi, 0.5 * np.pi  # [rad/s]
 # For two pieces: common duration [s]; velocities forward and to the left [m/s]; yaw rates [rad/s].
 _PIECES = {
@@ -78,6 +75,9 @@ _PIECES = {
     "eight": (4.0, ((0.3, 0.0), (0.3, 0.0)), (_HALF, -_HALF)),
     "stop-and-go": (1.0, ((0.5, 0.0), (0.0, 0.0)), (0.0, 0.0)),
 }
+
+UNSEEN = tuple(name for name in _PIECES if name not in COMMANDS)
+"""Trajectories beyond the paper, to test weights that were tuned on others."""
 
 
 def named_command(name: str) -> Command:

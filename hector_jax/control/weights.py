@@ -51,9 +51,10 @@ def direction_names(like: Weights | None = None) -> tuple[str, ...]:
 
 def _weights(rows: tuple, feet: int = 2, moments: bool = True) -> Weights:
     """Build weights from six triples in the order of State and Wrench, one R for all feet."""
-    Q, (force, moment) = np.array(rows[:4], float), np.array(rows[4:], float)
+    euler, position, turning, moving, force, moment = np.array(rows, float)
     moment = moment if moments else moment[:0]
-    return Weights(State(*Q), Wrench(np.tile(force, (feet, 1)), np.tile(moment, (feet, 1))))
+    Q = State(euler, position, turning, moving)
+    return Weights(Q, Wrench(np.tile(force, (feet, 1)), np.tile(moment, (feet, 1))))
 
 
 def named_like(names: Collection[str]) -> Weights:

@@ -158,7 +158,7 @@ def judge_cells(cells: Cells) -> Judgement:
     names = sets_of(cells)
     pairs = [(n, b) for n in names for b in BASELINES if b in names and b != n]
     return Judgement(
-        {pair: against(cells, *pair) for pair in pairs},
+        {(n, b): against(cells, n, b) for n, b in pairs},
         [(n, b) for n, b in pairs if n not in BASELINES] or pairs[-1:],
         {name: falls(cells, name) for name in names},
         agreements(cells),
