@@ -74,6 +74,16 @@ PUBLIC = {  # of packages without `__all__`, in whichever of their modules they 
     "export": "export",
     "report": "compare_runs write_film",
 }
+MENU = {  # of the site: pages by caption, in this order
+    "Start": "start concepts tutorial notebooks/tune notebooks/phi",
+    "Guides": """howto/weights howto/trajectory howto/robot howto/falls howto/loss howto/walks
+        howto/own howto/numbers export export-cpp howto/hardware howto/engines howto/gpu
+        howto/outputs howto/troubleshooting""",
+    "Results": "results reading limits performance",
+    "Method": "theory theory-additions qp paper",
+    "Reference": "commands robot-toml extending reference/hector_jax reference/*",
+    "Contributing": "decisions reliability",
+}
 _ROLE = re.compile(r"\{(?:func|class|mod|meth)\}`(hector_jax[\w.]*)`")
 logger = logging.getLogger(__name__)
 aliases: dict[str, str] = {}  # of names that pages link to: the name that the reference has
@@ -196,6 +206,15 @@ def _write_reference(app) -> None:
             path.write_text(text)
 
 
+def _add_menu(app, docname: str, source: list[str]) -> None:
+    """Add the menu to the page that is read first; a plain viewer would show it as code."""
+    if docname == "index":
+        options = ":hidden:\n:glob:\n"
+        for caption, pages in MENU.items():
+            names = "\n".join(pages.split())
+            source[0] += f"\n```{{toctree}}\n:caption: {caption}\n{options}\n{names}\n```\n"
+
+
 def _by_other_name(app, env, node, content) -> nodes.reference | None:
     """A link to a name that is documented under another one."""
     target = aliases.get(node.get("reftarget"))
@@ -284,6 +303,7 @@ def _skip(app, what, name, obj, skip, options) -> bool | None:
 def setup(app) -> None:
     """Register the reference, the renderer of formulas and the hooks on docstrings."""
     app.connect("builder-inited", _write_reference)
+    app.connect("source-read", _add_menu)
     nothing = lambda translator, node: None  # noqa: E731
     app.add_html_math_renderer("mathml", (_inline, nothing), (_block, nothing))
     app.connect("missing-reference", _by_other_name)
