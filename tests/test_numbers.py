@@ -202,7 +202,7 @@ def test_a_slope_by_walks_is_that_of_the_loss(toy):
     for of in OTHERS[:2]:
         there, step = nudged(START, of, 0.1)
         moved[of.name] = step, log, toy_log(there).log
-    found, matrix = walks._slope(one, START, 0, log, moved)
+    found, matrix = walks.slope_of_walk(one, START, 0, log, moved)
 
     def square(log):
         return sum(float(np.sum(x**2)) for x in residuals_of(CONFIG, OWN, AHEAD, log))

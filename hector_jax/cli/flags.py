@@ -188,6 +188,8 @@ class Tune(Configured, ByWalker, ByPlanner, Parallel):
 
     usual = frozenset("traj start tune seeds smooth safe walks robot walker out resume".split())
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
+    # trajectories that no set may make 10 % worse, which a --walker walks too
+    keep: Trajectories = ()
     start: Weights = "nominal"  # where to start: nominal, expert, best or a weights file
     # weights: Q and R; also footsteps, integral, all, or numbers by name;
     # `best` has the gains of the integral action in any case

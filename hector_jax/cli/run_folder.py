@@ -66,7 +66,9 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
     loaded = arguments.load_trajectories(args.traj, robot)
     _check_walker(args, robot)
     by_walks = len(numbers_by_walks(arguments.own_numbers(args, robot)))
-    best_set.walk_plants(robot, args.walk_plants, args.walks, len(loaded), by_walks)
+    kept = len(kept_trajectories(args, robot, loaded))
+    given = args.walk_plants, args.walks, len(loaded)
+    best_set.walk_plants(robot, *given, numbers=by_walks, kept=kept)
     if args.net:
         load_trained(args.net, robot, args.variant)
     arguments.engine_of(args)  # whether it is installed
@@ -77,11 +79,29 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
     return loaded
 
 
+def kept_trajectories(
+    args: Tune, robot: Robot, tuned: Sequence[NamedCommand]
+) -> tuple[NamedCommand, ...]:
+    """Load the trajectories that a tuning keeps.
+
+    Raises:
+        InputError: there is no such trajectory, it is tuned, or is of another length.
+    """
+    loaded = arguments.load_trajectories((*args.traj, *args.keep), robot)
+    names = [trajectory.name for trajectory in tuned]
+    for name in arguments.trajectories_by_name(args.keep):
+        if name in names:
+            raise InputError(f"--keep {name} is tuned: it stands in --traj")
+    return tuple(x for x in loaded if x.name not in names)
+
+
 def _check_walker(args: Tune, robot: Robot) -> None:
     """Raise an InputError if the flags of a tuning do not go with a program of the user."""
     if args.walker is None:
         if args.planner:
             raise InputError("--planner plans for the walks of a --walker, which is not given")
+        if args.keep:
+            raise InputError("--keep names commands of a --walker, which is not given")
         arguments.require_walker(args, robot)
         return
     if not args.walks:
@@ -147,7 +167,7 @@ def resume(folder: Path, args: Tune) -> Tune:
     begun = from_file(Tune, path)
     robot = robot_hash(load_robot(begun.robot))
     check_settings(folder, {"robot": config["robot"]}, {"robot": robot}, remedy)
-    asked = with_given(replace(args, traj=_texts(args)), args.given)
+    asked = with_given(_named(args), args.given)
     flags = merge_flags(folder, begun, asked, call_flags=_CALL_FLAGS)
     data = arguments.data_folder(flags.data, flags.robot, load_robot(flags.robot))
     is_made = flags.walker or flags.net or data.exists()
@@ -199,9 +219,11 @@ def note_settings(folder: Path, settings: dict[str, Any]) -> dict[str, Any]:
     return recorded | settings
 
 
-def _texts(args: Tune) -> tuple[str, ...]:
-    """Return the trajectories of the flags, each by itself."""
-    return tuple(arguments.trajectories_by_name(args.traj).values())
+def _named(args: Tune) -> Tune:
+    """Return the flags with each trajectory by itself."""
+    names = arguments.trajectories_by_name
+    one = {flag: tuple(names(getattr(args, flag)).values()) for flag in ("traj", "keep")}
+    return replace(args, traj=one["traj"], keep=one["keep"])
 
 
 def plan_run(args: Tune) -> tuple[Path, Tune]:
@@ -211,7 +233,7 @@ def plan_run(args: Tune) -> tuple[Path, Tune]:
         InputError: one line with the flag that is wrong, or the folder exists.
     """
     robot = load_robot(args.robot)
-    flags = with_given(replace(args, traj=_texts(args)), args.given)
+    flags = with_given(_named(args), args.given)
     name = "-".join(trajectory.name for trajectory in trajectories(flags, robot))
     if args.out and args.out.exists():
         raise _exists_error(args.out)

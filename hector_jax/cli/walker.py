@@ -45,7 +45,7 @@ from hector_jax.verdict import judging, metrics
 from hector_jax.walk_tuning import best_set
 from hector_jax.walk_tuning.campaign import Campaign
 from hector_jax.walk_tuning.moved import numbers_by_walks, walks_needed
-from hector_jax.walk_tuning.walks import tune_on_walks
+from hector_jax.walk_tuning.walks import WalkTuning, tune_on_walks
 
 
 def run_check(args: Check) -> None:
@@ -180,6 +180,7 @@ def tune_walker(folder: Path, args: Tune) -> None:
         say(f"the walks of {args.walker} do not depend on `plant`: --walk-plants 1 tells as much")
     verdict = judged.verdict
     result = {**metrics.verdict_result({"standin": verdict}), "walks": tuned.rows}
+    result["kept"] = {name: x._asdict() for name, x in tuned.kept(tuned.best).items()}
     write_json(folder / RESULT, result)
 
     def print_text() -> None:
@@ -190,7 +191,27 @@ def tune_walker(folder: Path, args: Tune) -> None:
     means = {name: np.log(verdict.scores[name].L).mean() for name in compared}
     if means["best"] >= means["start"]:
         say("on plants that were not walked `best` is no better than the start: keep that")
+    for line in _kept_lines(tuned):
+        say(line)
     say(f"the weights are {folder / 'weights' / 'best.json'}")
+
+
+def _kept_lines(tuned: WalkTuning) -> Iterator[str]:
+    """Return what became of the commands to keep."""
+
+    def told(number: int, broken: bool) -> str:
+        found = {n: x for n, x in tuned.kept(number).items() if x.broken or not broken}
+        return ", ".join(
+            f"{name} {f'{x.change:+.0f} %' if x.change is not None else 'falls'}"
+            + f", {plural(x.falls, 'fall')}" * bool(x.falls)
+            for name, x in found.items()
+        )
+
+    if tuned.best:
+        yield from (f"kept, against the start: {x}" for x in [told(tuned.best, False)] if x)
+    elif refused := {i: x for i in range(len(tuned.sets)) if (x := told(i, True))}:
+        sets = "; ".join(f"set {i} {x}" for i, x in refused.items())
+        yield f"no better set keeps what it should ({sets}): `best` is the start"
 
 
 def _campaign(
@@ -201,17 +222,19 @@ def _campaign(
     trajectories: Sequence[NamedCommand],
 ) -> Campaign:
     """Return the settings of a tuning on the walks of a program."""
+    kept = run_folder.kept_trajectories(args, robot, trajectories)
+    given = args.walk_plants, args.walks, len(trajectories)
     by_walks = len(numbers_by_walks(config.others))
-    count = len(trajectories), by_walks
     return Campaign(
         folder / "walks",
         best_set.on_walks(config),
         robot,
         arguments.weights_by_name(args.start, robot),
         {trajectory.name: trajectory.command for trajectory in trajectories},
-        best_set.walk_plants(robot, args.walk_plants, args.walks, *count)[0],
+        best_set.walk_plants(robot, *given, numbers=by_walks, kept=len(kept))[0],
         arguments.engine_of(args),
         arguments.planner_of(args),
+        {trajectory.name: trajectory.command for trajectory in kept},
     )
 
 
