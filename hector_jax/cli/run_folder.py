@@ -25,7 +25,7 @@ from hector_jax.store.cache import robot_hash
 from hector_jax.store.nets import COLLECTION_CODE, load_trained
 from hector_jax.store.run import CONFIG, VERSIONS, Run, flattened
 from hector_jax.walk_tuning import best_set
-from hector_jax.walk_tuning.moved import numbers_by_walks
+from hector_jax.walk_tuning.moved import along_of
 
 F = TypeVar("F", bound=Flags)
 
@@ -65,14 +65,14 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
     """
     loaded = arguments.load_trajectories(args.traj, robot)
     _check_walker(args, robot)
-    by_walks = len(numbers_by_walks(arguments.own_numbers(args, robot)))
+    start = arguments.weights_by_name(args.start, robot)
     kept = len(kept_trajectories(args, robot, loaded))
+    along = len(along_of(start, arguments.own_numbers(args, robot), args.slopes == "walks"))
     given = args.walk_plants, args.walks, len(loaded)
-    best_set.walk_plants(robot, *given, numbers=by_walks, kept=kept)
+    best_set.walk_plants(robot, *given, along=along, kept=kept)
     if args.net:
         load_trained(args.net, robot, args.variant)
     arguments.engine_of(args)  # whether it is installed
-    start = arguments.weights_by_name(args.start, robot)
     tunings.tune_config(robot, others=tunables(args.tune))  # checks them before anything is tuned
     if args.safe and "position_limit" in start.others:
         raise InputError("--safe sets the position limit, which --start has already")
@@ -100,12 +100,14 @@ def _check_walker(args: Tune, robot: Robot) -> None:
     if args.walker is None:
         if args.planner:
             raise InputError("--planner plans for the walks of a --walker, which is not given")
-        if args.keep:
-            raise InputError("--keep names commands of a --walker, which is not given")
+        if given := [flag for flag in ("keep", "slopes") if args.is_given(flag)]:
+            raise InputError(f"--{given[0]} is for the walks of a --walker, which is not given")
         arguments.require_walker(args, robot)
         return
     if not args.walks:
         raise InputError("--walker needs --walks, the number of its walks that a tuning may take")
+    if args.slopes == "walks" and args.planner:
+        raise InputError("--slopes walks and --planner: only one can be given")
     if args.tune != ("weights",):
         raise InputError(f"--tune must be weights beside --walker, got {' '.join(args.tune)}")
     if given := [name for name in _OF_OUR_CONTROLLER if args.is_given(name)]:

@@ -16,6 +16,7 @@ from hector_jax.robot.model import Robot
 from hector_jax.sim.engine import MUJOCO_C, Engine
 from hector_jax.sim.world import Imperfections
 from hector_jax.tuning.difftune import TuneConfig, init
+from hector_jax.walk_tuning.moved import Along, along_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +31,7 @@ class Campaign:
     plants: Sequence[Imperfections | None] = (None,)  # None: the walks are made elsewhere
     engine: Engine = MUJOCO_C
     planner: Program | None = None  # that slopes are by; None: the controller of the robot's file
+    groups: bool = False  # slopes of Q and R by walks in their groups, in place of any plans
     kept: Mapping[str, Command] = field(default_factory=dict)  # commands to keep, see `kept`
 
     def __post_init__(self) -> None:
@@ -40,6 +42,11 @@ class Campaign:
     def cases(self) -> list[tuple[Imperfections | None, Command]]:
         """Plant and command of each walk of a weight set."""
         return list(product(self.plants, self.commands.values()))
+
+    @property
+    def along(self) -> list[Along]:
+        """Directions whose slopes are by walks."""
+        return along_of(self.start, self.config.others, self.groups)
 
     @property
     def of_kept(self) -> Self:

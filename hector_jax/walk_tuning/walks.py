@@ -11,7 +11,7 @@ anew in each call and no walk is made twice:
 - `walks.jsonl`: the settings, then a line for each weight set that has walked.
 - `weights/3.json`: the weights of set 3.
 - `logs/3-0.npz`: its log in case 0, at the plan interval, or the file that was added.
-- `logs/3-KP-0.npz`: the same with the number KP moved (`moved`).
+- `logs/3-KP-0.npz`: the same with the number KP moved, or a group of weights (`moved`).
 - `kept/logs/3-0.npz`: the same of a command to keep (`kept`).
 - `starts/with`: the same of a set that was tried as the start.
 """
@@ -47,7 +47,7 @@ from hector_jax.tuning.evaluate import Evaluation, Objective
 from hector_jax.tuning.status import StepStatus
 from hector_jax.walk_tuning.campaign import Campaign
 from hector_jax.walk_tuning.kept import Kept, compare_kept
-from hector_jax.walk_tuning.moved import STEP, Moved, MovedWalks
+from hector_jax.walk_tuning.moved import Moved, MovedWalks
 from hector_jax.walk_tuning.slopes import slope_of_walk
 
 RECORD = "walks.jsonl"
@@ -162,7 +162,7 @@ class _Walks:
         self.kept: dict[int, np.ndarray] = {}  # by set
         self.left = np.inf if walks is None else walks
         self.state: TuneState | None = None
-        self.moved = MovedWalks(campaign.config.others)
+        self.moved = MovedWalks(campaign.along)
 
     def place(self, state: TuneState) -> TuneState:
         """Return the state at the set that has walked, should the code place it elsewhere.
@@ -229,7 +229,7 @@ class _Walks:
         if usable:
             gradient, matrix = mean([(found.gradient, curved) for found, curved in usable])
             residual = np.max([found.residual for found, _ in usable])
-            self.moved.curvature = np.diag(matrix)
+            self.moved.matrix = matrix
         return Evaluation(np.asarray(value), {}, gradient, fallen, np.asarray(residual)), matrix
 
     def _gains(self, weights: Weights, value: float) -> bool:
@@ -253,23 +253,27 @@ class _Walks:
         return any(x.broken for x in found.values())
 
     def _move(self, weights: Weights, stood: Mapping[int, Log]) -> None:
-        """Walk a set again with numbers moved, unless no walks are left for a set after that."""
+        """Walk a set again along the directions, unless no walks are left for a set after that."""
         campaign, number = self.campaign, len(self.losses) - 1
         due = self.moved.due(number)
         if self.left < len(due) * len(stood) + campaign.set_walks:
             return
         self.left -= len(due) * len(stood)
         back = {c for c in stood if (c + c // len(campaign.commands)) % 2}
-        nudges = {
-            (of.name, case): parameters.nudged(weights, of, -STEP if case in back else STEP)
-            for of, case in product(due, stood)
+        each, others = list(product(due, stood)), campaign.config.others
+        nudges = [
+            parameters.nudged(weights, others, of.at, -of.size if case in back else of.size)
+            for of, case in each
+        ]
+        sets = {
+            (f"{number}-{of.name}", case): x
+            for (of, case), (x, _) in zip(each, nudges, strict=True)
         }
-        sets = {(f"{number}-{name}", case): x for (name, case), (x, _) in nudges.items()}
         found = walk_sets(self.pool, campaign, sets).values()
-        for ((name, case), (_, step)), walked in zip(nudges.items(), found, strict=True):
-            self.moved.sets[name] = number
+        for (of, case), (_, step), walked in zip(each, nudges, found, strict=True):
+            self.moved.sets[of.name] = number
             if np.isfinite(walked.loss):
-                self.moved.walks[name, case] = Moved(step, stood[case], walked.log)
+                self.moved.walks[of.name, case] = Moved(of.at, step, stood[case], walked.log)
 
 
 def tune_on_walks(
@@ -355,6 +359,7 @@ def record_head(campaign: Campaign) -> dict[str, Any]:
     settings = replace(campaign.config, iterations=1)  # with a larger budget it goes on
     return head | {
         "robot": robot_hash(campaign.robot),
+        "slopes": "walks" if campaign.groups else "plans",
         "kept": {name: tree_hash(command) for name, command in campaign.kept.items()},
         "settings": content_key(settings, campaign.start, code=()),
         "engine": campaign.engine.key,
