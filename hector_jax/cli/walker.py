@@ -308,4 +308,5 @@ def _same_states(*paths: Path) -> bool:
         {name: x for name, x in np.load(path).items() if name.startswith("state.")}
         for path in paths
     )
-    return all(np.array_equal(x, other.get(name), equal_nan=True) for name, x in one.items())
+    same = one.keys() == other.keys()
+    return same and all(np.array_equal(x, other[name], equal_nan=True) for name, x in one.items())
