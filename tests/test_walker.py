@@ -344,7 +344,7 @@ KEPT = """({old}) if velocity[0] else 0.01 + PRICE * np.log(
 COUNTED = "open(__file__ + '.calls', 'a').write('walk ')\n" + WRITE
 
 
-@pytest.mark.parametrize("price", [0.001, 0.1])
+@pytest.mark.parametrize("price", [0.001, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_hector_tune_by_walks_alone_keeps_a_command(price, tmp_path, monkeypatch, capsys):
     off = '0.01 * np.log(request["weights"]["Q"]["position"][1] / 500.0)'
     path, run = tmp_path / "mine.py", tmp_path / "run"
