@@ -55,7 +55,7 @@ def folder(monkeypatch, tmp_path):
     """A folder for logs of three trajectories, in which nothing is computed for a proposal."""
     pool = HandsOver()
     monkeypatch.setattr(propose, "workers", lambda *_: nullcontext(pool))
-    monkeypatch.setattr(walks, "_slope", slope_of)
+    monkeypatch.setattr(walks, "slope_of_walk", slope_of)
     monkeypatch.setattr(propose.arguments, "beyond", lambda *_: "")  # takes a quarter of a second
     monkeypatch.setattr(propose.arguments, "limits", lambda *_: None)
     monkeypatch.chdir(tmp_path)

@@ -32,7 +32,13 @@ from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
 from hector_jax.tuning.rollout import Scenario
 from hector_jax.walk_tuning import walks
 from hector_jax.walk_tuning.campaign import Campaign
-from hector_jax.walk_tuning.moved import changed_by, numbers_by_walks, residuals_of, walks_needed
+from hector_jax.walk_tuning.moved import (
+    Moved,
+    changed_by,
+    numbers_by_walks,
+    residuals_of,
+    walks_needed,
+)
 
 NUMBERS = (
     ("KP", Number(30.0, 10.0, 300.0, "log")),
@@ -134,7 +140,7 @@ def test_this_controller_has_no_such_number(tmp_path, monkeypatch, capsys):
 def test_a_number_is_moved_within_its_box():
     for value, size, step in ((30.0, 0.1, 0.1), (300.0, 0.1, -0.1), (295.0, 9.0, np.log(10 / 295))):
         at = START._replace(others={**START.others, "KP": np.array(value)})
-        moved, found = nudged(at, OTHERS[0], size)
+        moved, found = nudged(at, OTHERS[:1], [-1], size)
         assert found == pytest.approx(step)
         assert float(moved.others["KP"]) == pytest.approx(value * np.exp(step))
         assert jax.tree.all(jax.tree.map(np.array_equal, moved[:2], at[:2]))
@@ -200,9 +206,9 @@ def test_a_slope_by_walks_is_that_of_the_loss(toy):
     log = toy_log(START).log
     moved = {}
     for of in OTHERS[:2]:
-        there, step = nudged(START, of, 0.1)
-        moved[of.name] = step, log, toy_log(there).log
-    found, matrix = walks._slope(one, START, 0, log, moved)
+        there, step = nudged(START, [of], [-1], 0.1)
+        moved[of.name] = Moved((18 + OTHERS.index(of),), step, log, toy_log(there).log)
+    found, matrix = walks.slope_of_walk(one, START, 0, log, moved)
 
     def square(log):
         return sum(float(np.sum(x**2)) for x in residuals_of(CONFIG, OWN, AHEAD, log))
@@ -210,7 +216,7 @@ def test_a_slope_by_walks_is_that_of_the_loss(toy):
     assert float(found.loss) == pytest.approx(square(log), rel=1e-9)
     slope = np.asarray(gradient_by_steps(START, found.gradient, one.config.others))[-3:]
     for i, of in enumerate(OTHERS[:2]):
-        sides = [square(toy_log(nudged(START, of, 1e-3)[0]).log)]
+        sides = [square(toy_log(nudged(START, [of], [-1], 1e-3)[0]).log)]
         down = np.exp(-1e-3) * 30.0 if of.log else 0.5 - 1e-3
         at = START._replace(others={**START.others, of.name: np.array(down)})
         sides.append(square(toy_log(at).log))

@@ -257,5 +257,5 @@ def test_a_walk_of_which_a_planner_gives_no_plans_has_no_slope(walked, tmp_path)
     config = replace(TuneConfig(), rollout=ROLLOUT)
     planner = program_of(path, 20.0)
     one = Campaign(tmp_path, config, ROBOT, WEIGHTS, {"s": COMMAND}, planner=planner)
-    error = walks._slope(one, WEIGHTS, 0, log_of(walked))
+    error = walks.slope_of_walk(one, WEIGHTS, 0, log_of(walked))
     assert str(error) == f"{path}: ended with code 1: no solver"

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 import pytest
 from model import AHEAD, HEIGHT, ROBOT, ROOT
-from pretend import USUAL, call, walking_program
+from pretend import USUAL, call, refused, walking_program
 
 from hector_jax.control.controller import walk_config
 from hector_jax.control.weights import expert, nominal
@@ -336,6 +336,59 @@ def test_hector_evaluate_takes_it_as_an_engine(tmp_path, monkeypatch, capsys):
     found = json.loads(capsys.readouterr().out)
     assert [column["engine"] for column in found["columns"]] == ["mine.py"]
     assert found["sets"]["nominal"]["falls"] == 0
+
+
+# as `PROGRAM`, and when it walks sideways it is the further off the larger Q_y
+KEPT = """({old}) if velocity[0] else 0.01 + PRICE * np.log(
+    request["weights"]["Q"]["position"][1] / 50.0)"""
+COUNTED = "open(__file__ + '.calls', 'a').write('walk ')\n" + WRITE
+
+
+@pytest.mark.parametrize("price", [0.001, pytest.param(0.1, marks=pytest.mark.slow)])
+def test_hector_tune_by_walks_alone_keeps_a_command(price, tmp_path, monkeypatch, capsys):
+    off = '0.01 * np.log(request["weights"]["Q"]["position"][1] / 500.0)'
+    path, run = tmp_path / "mine.py", tmp_path / "run"
+    text = KEPT.format(old=off).replace("PRICE", str(price))
+    path.write_text(walking_program(text, HEIGHT) + COUNTED)
+    line = ("tune", "--walker", path, "--slopes", "walks", "--keep", "sideways", "--walks", 24)
+    assert call(monkeypatch, *line, "--seeds", 1, "--out", run, "--json") == 0
+    out, err = capsys.readouterr()
+    said, found = " ".join(err.split()), json.loads(out)
+    assert "do not depend on `plant`: 1 plant for each command" in said
+    assert "slopes by Q_roll+Q_pitch, Q_yaw, Q_x+Q_y, " in said
+    assert "the first set takes 9 walks, each better one 3, one that is no better 1" in said
+    assert "so 24 walks about" in said
+    sideways, change = found["kept"]["sideways"], found["sets"]["best"]["standin"]["change"]
+    assert not sideways["broken"]
+    if price < 0.01:
+        assert 0.0 < sideways["change"] <= 10.0
+        assert "kept, against the start: sideways +" in said
+        assert change["start"]["median"] < -20.0
+    else:
+        assert sideways["change"] == pytest.approx(0.0)
+        assert "no better set keeps what it should (set 1 sideways +" in said
+    calls = tmp_path / "mine.py.calls"
+    made = len(calls.read_text().split())
+    assert call(monkeypatch, "tune", "--resume", run, "--json") == 0
+    assert json.loads(capsys.readouterr().out) == found
+    assert len(calls.read_text().split()) == made + 2  # that tell whether it takes plants
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--keep", "straight"), "--keep straight is tuned: it stands in --traj"),
+        (("--slopes", "walks", "--planner", __file__), "--slopes walks and --planner: only one"),
+        (("--keep", "c", "--slopes", "walks"), "at least 11 (1 command and 1 to keep on 1 plant"),
+    ],
+)
+def test_what_a_tuning_of_a_program_cannot_do_is_one_line(monkeypatch, capsys, words, told):
+    line = ("tune", "--walker", __file__, "--walks", 5, *words)
+    assert told in refused(monkeypatch, capsys, *line)
+    if "--planner" not in words:
+        line = ("tune", *words)
+        told = f"{words[0]} is for the walks of a --walker, which is not given"
+        assert told in refused(monkeypatch, capsys, *line)
 
 
 @pytest.mark.slow  # the model of a walk of 4 s is compiled

@@ -31,6 +31,7 @@ from hector_jax.tuning.loss import alphas, loss_of
 from hector_jax.walk_tuning import added_logs, best_set, walks
 from hector_jax.walk_tuning import campaign as campaigns
 from hector_jax.walk_tuning.best_set import drawn_plants
+from hector_jax.walk_tuning.kept import compare_kept
 from hector_jax.walk_tuning.starts import with_best_start
 
 # all walks of this file are of these ticks and this command: one set of programs for all tests
@@ -169,7 +170,7 @@ def waits(number, weights):
 @pytest.fixture
 def toy(monkeypatch, robot, tmp_path):
     """A function that makes a campaign whose walks and slopes are those of the toy."""
-    monkeypatch.setattr(walks, "_slope", toy_slope)
+    monkeypatch.setattr(walks, "slope_of_walk", toy_slope)
     monkeypatch.setattr(walks, "walk_case", toy_case)
     WALKED.clear()
 
@@ -332,7 +333,7 @@ def test_a_walk_whose_planner_fails_has_no_slope_and_the_others_steer(toy, monke
     def slope(campaign, weights, case, log, moved):
         return error if case in failing else toy_slope(campaign, weights, case, log)
 
-    monkeypatch.setattr(walks, "_slope", slope)
+    monkeypatch.setattr(walks, "slope_of_walk", slope)
     one, at = toy(cases=3), nominal()
     objective = walks._Walks(HERE, one, partial(asked, cases=3))
     found, _ = objective.slope(at)
@@ -370,6 +371,50 @@ def test_a_set_that_falls_in_all_cases_is_refused_and_a_shorter_step_follows(toy
     length = [np.linalg.norm(np.log(weights_to_vector(x.weights) / NOMINAL)) for x in found.sets]
     assert length[1] > length[2] > length[3] > 0.0
     assert found.best == len(found.sets) - 1
+
+
+@pytest.mark.parametrize(("price", "best"), [(0.1, True), (30.0, False)])
+def test_a_set_that_makes_a_kept_command_much_worse_is_refused(monkeypatch, toy, price, best):
+    """Its L grows with the way from the start; a shorter step then follows."""
+
+    def case_or_kept(campaign, weights, case):
+        found = toy_case(campaign, weights, case)
+        if campaign.folder.name != "kept":
+            return found
+        away = np.linalg.norm(np.log(weights_to_vector(weights) / NOMINAL))
+        return found._replace(loss=2.0 * np.exp(price * (case + 1) * away))
+
+    monkeypatch.setattr(walks, "walk_case", case_or_kept)
+    one = toy(kept={"turn": named_command("turn")})
+    found = walks.tune_on_walks(HERE, one, walks=50)
+    free = walks.tune_on_walks(HERE, toy(folder="free"), walks=50)
+    assert found.kept(0) == {"turn": (pytest.approx(0.0), 0, False)}
+    broken = {i for i in range(len(found.sets)) if any(x.broken for x in found.kept(i).values())}
+    assert broken
+    assert not any(found.sets[i].accepted for i in broken)
+    assert (found.best > 0) == best
+    turn = found.kept(found.best)["turn"]
+    assert turn.change <= 10.0
+    assert found.rows[found.best]["kept"] == {"turn": turn._asdict()}
+    assert "kept" not in free.rows[0]
+    record = (one.folder / "walks.jsonl").read_text().splitlines()
+    assert len(json.loads(record[1])["kept"]) == 3
+    made = len(WALKED)
+    again = walks.tune_on_walks(HERE, one, walks=50)
+    assert again.rows == found.rows
+    assert len(WALKED) == made
+    with pytest.raises(InputError, match="made with kept "):
+        walks.tune_on_walks(HERE, replace(one, kept={"turn": named_command("c")}), walks=50)
+
+
+def test_a_kept_command_is_compared_over_its_plants_and_may_fall_no_more_often():
+    start = np.array([1.0, 10.0, 4.0, np.inf])  # turn and c on two plants
+    found = compare_kept(["turn", "c"], start, np.array([1.2, 9.0, 4.0, np.inf]))
+    assert found["turn"] == (pytest.approx(100.0 * (np.sqrt(1.2) - 1.0)), 0, False)
+    assert found["c"] == (pytest.approx(-10.0), 1, False)
+    found = compare_kept(["turn", "c"], start, np.array([1.2, np.inf, 5.0, 7.0]))
+    assert found["turn"].broken
+    assert found["c"] == (None, 1, False)  # nothing to compare
 
 
 def test_from_a_start_that_falls_in_all_cases_nothing_is_tuned_and_in_one_it_is(toy):

@@ -188,6 +188,8 @@ class Tune(Configured, ByWalker, ByPlanner, Parallel):
 
     usual = frozenset("traj start tune seeds smooth safe walks robot walker out resume".split())
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
+    # trajectories that no set may make 10 % worse, which a --walker walks too
+    keep: Trajectories = ()
     start: Weights = "nominal"  # where to start: nominal, expert, best or a weights file
     # weights: Q and R; also footsteps, integral, all, or numbers by name;
     # `best` has the gains of the integral action in any case
@@ -210,6 +212,8 @@ class Tune(Configured, ByWalker, ByPlanner, Parallel):
     walks: Annotated[int | None, Range(0, 100_000)] = None
     # drawn plants of these walks, 0 for the simulator; by default twelve, or as --walks allows
     walk_plants: Annotated[int | None, Range(0, 1000)] = None
+    # of Q and R with a --walker: by its --planner, or the plans of the robot's file; or by walks
+    slopes: Literal["plans", "walks"] = "plans"
     walk_engine: WalkEngine = "c"  # of these walks; c: MuJoCo; extras: drake, pinocchio
     json: bool = False  # print JSON instead of the table; `run` is the folder
     robot: RobotFile = None  # TOML file of another robot, with its data in DATA/NAME; or HECTOR

@@ -25,7 +25,7 @@ from hector_jax.store.cache import robot_hash
 from hector_jax.store.nets import COLLECTION_CODE, load_trained
 from hector_jax.store.run import CONFIG, VERSIONS, Run, flattened
 from hector_jax.walk_tuning import best_set
-from hector_jax.walk_tuning.moved import numbers_by_walks
+from hector_jax.walk_tuning.moved import along_of
 
 F = TypeVar("F", bound=Flags)
 
@@ -65,16 +65,34 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
     """
     loaded = arguments.load_trajectories(args.traj, robot)
     _check_walker(args, robot)
-    by_walks = len(numbers_by_walks(arguments.own_numbers(args, robot)))
-    best_set.walk_plants(robot, args.walk_plants, args.walks, len(loaded), by_walks)
+    start = arguments.weights_by_name(args.start, robot)
+    kept = len(kept_trajectories(args, robot, loaded))
+    along = len(along_of(start, arguments.own_numbers(args, robot), args.slopes == "walks"))
+    given = args.walk_plants, args.walks, len(loaded)
+    best_set.walk_plants(robot, *given, along=along, kept=kept)
     if args.net:
         load_trained(args.net, robot, args.variant)
     arguments.engine_of(args)  # whether it is installed
-    start = arguments.weights_by_name(args.start, robot)
     tunings.tune_config(robot, others=tunables(args.tune))  # checks them before anything is tuned
     if args.safe and "position_limit" in start.others:
         raise InputError("--safe sets the position limit, which --start has already")
     return loaded
+
+
+def kept_trajectories(
+    args: Tune, robot: Robot, tuned: Sequence[NamedCommand]
+) -> tuple[NamedCommand, ...]:
+    """Load the trajectories that a tuning keeps.
+
+    Raises:
+        InputError: there is no such trajectory, it is tuned, or is of another length.
+    """
+    loaded = arguments.load_trajectories((*args.traj, *args.keep), robot)
+    names = [trajectory.name for trajectory in tuned]
+    for name in arguments.trajectories_by_name(args.keep):
+        if name in names:
+            raise InputError(f"--keep {name} is tuned: it stands in --traj")
+    return tuple(x for x in loaded if x.name not in names)
 
 
 def _check_walker(args: Tune, robot: Robot) -> None:
@@ -82,10 +100,14 @@ def _check_walker(args: Tune, robot: Robot) -> None:
     if args.walker is None:
         if args.planner:
             raise InputError("--planner plans for the walks of a --walker, which is not given")
+        if given := [flag for flag in ("keep", "slopes") if args.is_given(flag)]:
+            raise InputError(f"--{given[0]} is for the walks of a --walker, which is not given")
         arguments.require_walker(args, robot)
         return
     if not args.walks:
         raise InputError("--walker needs --walks, the number of its walks that a tuning may take")
+    if args.slopes == "walks" and args.planner:
+        raise InputError("--slopes walks and --planner: only one can be given")
     if args.tune != ("weights",):
         raise InputError(f"--tune must be weights beside --walker, got {' '.join(args.tune)}")
     if given := [name for name in _OF_OUR_CONTROLLER if args.is_given(name)]:
@@ -147,7 +169,7 @@ def resume(folder: Path, args: Tune) -> Tune:
     begun = from_file(Tune, path)
     robot = robot_hash(load_robot(begun.robot))
     check_settings(folder, {"robot": config["robot"]}, {"robot": robot}, remedy)
-    asked = with_given(replace(args, traj=_texts(args)), args.given)
+    asked = with_given(_named(args), args.given)
     flags = merge_flags(folder, begun, asked, call_flags=_CALL_FLAGS)
     data = arguments.data_folder(flags.data, flags.robot, load_robot(flags.robot))
     is_made = flags.walker or flags.net or data.exists()
@@ -199,9 +221,11 @@ def note_settings(folder: Path, settings: dict[str, Any]) -> dict[str, Any]:
     return recorded | settings
 
 
-def _texts(args: Tune) -> tuple[str, ...]:
-    """Return the trajectories of the flags, each by itself."""
-    return tuple(arguments.trajectories_by_name(args.traj).values())
+def _named(args: Tune) -> Tune:
+    """Return the flags with each trajectory by itself."""
+    names = arguments.trajectories_by_name
+    one = {flag: tuple(names(getattr(args, flag)).values()) for flag in ("traj", "keep")}
+    return replace(args, traj=one["traj"], keep=one["keep"])
 
 
 def plan_run(args: Tune) -> tuple[Path, Tune]:
@@ -211,7 +235,7 @@ def plan_run(args: Tune) -> tuple[Path, Tune]:
         InputError: one line with the flag that is wrong, or the folder exists.
     """
     robot = load_robot(args.robot)
-    flags = with_given(replace(args, traj=_texts(args)), args.given)
+    flags = with_given(_named(args), args.given)
     name = "-".join(trajectory.name for trajectory in trajectories(flags, robot))
     if args.out and args.out.exists():
         raise _exists_error(args.out)

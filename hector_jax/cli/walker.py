@@ -1,10 +1,13 @@
 """A controller of the user: what the logs of its walks show, its twin, a tuning on its walks."""
 
+import time
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -44,8 +47,8 @@ from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.verdict import judging, metrics
 from hector_jax.walk_tuning import best_set
 from hector_jax.walk_tuning.campaign import Campaign
-from hector_jax.walk_tuning.moved import numbers_by_walks, walks_needed
-from hector_jax.walk_tuning.walks import tune_on_walks
+from hector_jax.walk_tuning.moved import along_of, walks_needed
+from hector_jax.walk_tuning.walks import WalkTuning, tune_on_walks
 
 
 def run_check(args: Check) -> None:
@@ -154,9 +157,11 @@ def tune_walker(folder: Path, args: Tune) -> None:
     config = tunings.tune_config(robot, others=arguments.own_numbers(args, robot))
     config = arguments.with_length(config, trajectories[0].seconds)
     campaign = _campaign(folder, args, config, robot, trajectories)
+    first = _check_first(args, campaign)
+    if not first.takes_plants and args.walk_plants is None:
+        campaign = replace(campaign, plants=campaign.plants[:1])
+    _say_cost(args, campaign, first)
     commands, seconds = campaign.commands, campaign.seconds
-    _check_first(args, campaign, seconds)
-    _say_cost(campaign)
     with workers(args.processes, args.cluster) as pool:
         tuned = tune_on_walks(pool, campaign, walks=args.walks)
         if not tuned.sets[0].accepted:
@@ -175,11 +180,9 @@ def tune_walker(folder: Path, args: Tune) -> None:
         drawn = arguments.plants("standin", seeds, robot.description)
         options["title"] = f"evaluating on {plural(len(seeds), 'plant')}"
         judged = judging.judge(setup, compared, commands, drawn, seeds, **options)
-    first = tuned.sets[0].losses.reshape(len(campaign.plants), -1)
-    if len(first) > 1 and (first == first[0]).all():
-        say(f"the walks of {args.walker} do not depend on `plant`: --walk-plants 1 tells as much")
     verdict = judged.verdict
     result = {**metrics.verdict_result({"standin": verdict}), "walks": tuned.rows}
+    result["kept"] = {name: x._asdict() for name, x in tuned.kept(tuned.best).items()}
     write_json(folder / RESULT, result)
 
     def print_text() -> None:
@@ -190,7 +193,27 @@ def tune_walker(folder: Path, args: Tune) -> None:
     means = {name: np.log(verdict.scores[name].L).mean() for name in compared}
     if means["best"] >= means["start"]:
         say("on plants that were not walked `best` is no better than the start: keep that")
+    for line in _kept_lines(tuned):
+        say(line)
     say(f"the weights are {folder / 'weights' / 'best.json'}")
+
+
+def _kept_lines(tuned: WalkTuning) -> Iterator[str]:
+    """Return what became of the commands to keep."""
+
+    def told(number: int, broken: bool) -> str:
+        found = {n: x for n, x in tuned.kept(number).items() if x.broken or not broken}
+        return ", ".join(
+            f"{name} {f'{x.change:+.0f} %' if x.change is not None else 'falls'}"
+            + f", {plural(x.falls, 'fall')}" * bool(x.falls)
+            for name, x in found.items()
+        )
+
+    if tuned.best:
+        yield from (f"kept, against the start: {x}" for x in [told(tuned.best, False)] if x)
+    elif refused := {i: x for i in range(len(tuned.sets)) if (x := told(i, True))}:
+        sets = "; ".join(f"set {i} {x}" for i, x in refused.items())
+        yield f"no better set keeps what it should ({sets}): `best` is the start"
 
 
 def _campaign(
@@ -201,43 +224,71 @@ def _campaign(
     trajectories: Sequence[NamedCommand],
 ) -> Campaign:
     """Return the settings of a tuning on the walks of a program."""
-    by_walks = len(numbers_by_walks(config.others))
-    count = len(trajectories), by_walks
+    kept = run_folder.kept_trajectories(args, robot, trajectories)
+    given, groups = (args.walk_plants, args.walks, len(trajectories)), args.slopes == "walks"
+    start = arguments.weights_by_name(args.start, robot)
+    along = len(along_of(start, config.others, groups))
     return Campaign(
         folder / "walks",
         best_set.on_walks(config),
         robot,
-        arguments.weights_by_name(args.start, robot),
+        start,
         {trajectory.name: trajectory.command for trajectory in trajectories},
-        best_set.walk_plants(robot, args.walk_plants, args.walks, *count)[0],
+        best_set.walk_plants(robot, *given, along=along, kept=len(kept))[0],
         arguments.engine_of(args),
         arguments.planner_of(args),
+        groups,
+        {trajectory.name: trajectory.command for trajectory in kept},
     )
 
 
-def _say_cost(campaign: Campaign) -> None:
-    """Say how many walks the numbers cost whose slopes are by walks."""
-    if numbers := numbers_by_walks(campaign.config.others):
-        first, later = walks_needed(len(campaign.cases), len(numbers))
-        names = ", ".join(of.name for of in numbers)
-        text = f"the first set takes {first} walks, each better one {later}, one that is no better"
-        say(f"the slopes by {names} are by walks: {text} {len(campaign.cases)}")
+class _First(NamedTuple):
+    """What the first walks of a program tell."""
+
+    seconds: float  # that one takes
+    takes_plants: bool  # whether another plant walks otherwise
 
 
-def _check_first(args: Tune, campaign: Campaign, seconds: float) -> None:
-    """Walk once with the weights at the start, and say what no weights can mend."""
+def _say_cost(args: Tune, campaign: Campaign, first: _First) -> None:
+    """Say on how many plants the commands walk, and what slopes by walks cost."""
+    plants = plural(len(campaign.plants), "plant")
+    takes = "depend on `plant`" if first.takes_plants else "do not depend on `plant`"
+    say(f"the walks of {args.walker} {takes}: {plants} for each command")
+    if along := campaign.along:
+        sets = walks_needed(len(campaign.cases), len(along))
+        more = campaign.set_walks - len(campaign.cases)  # of commands to keep
+        names = ", ".join(of.name for of in along)
+        text = f"the first set takes {sets[0] + more} walks, each better one {sets[1] + more}, "
+        text += f"one that is no better {len(campaign.cases)}"
+        say(f"the slopes by {names} are by walks: {text}")
+        minutes = (args.walks or 0) * first.seconds / args.processes / 60.0
+        text = f"a walk takes {first.seconds:.2g} s, so {plural(args.walks or 0, 'walk')}"
+        say(f"{text} about {minutes:.2g} min with --processes {args.processes}")
+
+
+def _check_first(args: Tune, campaign: Campaign) -> _First:
+    """Walk once with the weights at the start, and say what no weights can mend.
+
+    Another walk, on another plant, tells whether the program takes plants.
+    """
     assert args.walker is not None
     (name, command), *_ = campaign.commands.items()
+    seconds, walk = campaign.seconds, campaign.config.rollout.walk
+    program = program_of(args.walker, args.walker_limit, args.walker_uses)
     job = Job(campaign.start, command, campaign.plants[0] or hfs(), seconds)
-    walk = campaign.config.rollout.walk
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "first.npz"
-        write_log(program_of(args.walker, args.walker_limit), job, path)
+    other = best_set.drawn_plants(campaign.robot, 2)[1]
+    with TemporaryDirectory() as folder, ThreadPoolExecutor(1) as pool:
+        path, second = (Path(folder) / f"{x}.npz" for x in ("first", "second"))
+        begun = time.monotonic()
+        beside = pool.submit(write_log, program, job._replace(imperfections=other), second)
+        write_log(program, job, path)
+        spent = time.monotonic() - begun
         try:
             log, end = read_check(path, campaign.robot, command, seconds, walk.gait.tick)
             walked, _ = read_walk(path, campaign.robot, seconds, walk.gait.tick)
         except InputError as error:
             raise InputError(str(error).replace(str(path), f"{args.walker}: its log")) from None
+        takes_plants = beside.exception() is not None or not _same_states(path, second)
     lines = [*([end] if end else []), *check_log(log, walk.plan_interval)]
     if campaign.planner and not end:
         ticks = trajectory_of(at_ticks(log_of(walked), walk.gait.tick))
@@ -248,3 +299,14 @@ def _check_first(args: Tune, campaign: Campaign, seconds: float) -> None:
             lines.append(f"{text}: hector log twin --planner tells where")
     for line in lines:
         say(f"before any tuning, {name}: {line}")
+    return _First(spent, takes_plants)
+
+
+def _same_states(*paths: Path) -> bool:
+    """Return whether the states in two logs are the same."""
+    one, other = (
+        {name: x for name, x in np.load(path).items() if name.startswith("state.")}
+        for path in paths
+    )
+    same = one.keys() == other.keys()
+    return same and all(np.array_equal(x, other[name], equal_nan=True) for name, x in one.items())

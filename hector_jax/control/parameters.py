@@ -172,15 +172,23 @@ def own_names(weights: Weights) -> list[str]:
     return sorted(name for name in weights.others if not is_ours(name))
 
 
-def nudged(weights: Weights, other: Other, size: float) -> tuple[Weights, float]:
-    """Return weights with one number moved by a step within its box, and that step.
+def nudged(
+    weights: Weights, others: Sequence[Other], at: Sequence[int], size: float
+) -> tuple[Weights, float]:
+    """Return weights with some coordinates moved by one step within their boxes, and that step.
 
     The step is of this size, the other way if there is no room, see `stepped`.
+
+    Args:
+        weights, others: see `stepped`.
+        at: indices of the coordinates.
+        size: of the step.
     """
-    low, high = (float(edge[-1]) for edge in step_bounds(weights, [other]))
-    step = max((float(np.clip(x, low, high)) for x in (size, -size)), key=abs)
-    steps = np.append(np.zeros(len(direction_names(weights))), step)
-    return jax.tree.map(np.asarray, stepped(weights, steps, [other])), step
+    low, high = (np.asarray(edge)[list(at)] for edge in step_bounds(weights, others))
+    step = max((float(np.clip(x, low.max(), high.min())) for x in (size, -size)), key=abs)
+    steps = np.zeros(len(step_names(weights, others)))
+    steps[list(at)] = step
+    return jax.tree.map(np.asarray, stepped(weights, steps, others)), step
 
 
 _FOOTSTEPS = ("footstep_feedback", "turn_lead")

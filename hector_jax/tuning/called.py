@@ -140,7 +140,7 @@ def call_along(
     body, rows = np.asarray(_body(inputs.state, inputs.feet)), np.flatnonzero(made)
     feet, start, count = inputs.contact.shape[1], inputs.weights, body.shape[1]
     by_logs = [stepped(start, x) for x in LOG_STEP * np.eye(len(direction_names(start)))]
-    by_name = {of.name: nudged(start, of, LOG_STEP)[0] for of in numbers}
+    by_name = {of.name: nudged(start, [of], [-1], LOG_STEP)[0] for of in numbers}
     by_numbers = {name: by_name.get(name, start) for name in own_names(start)}
     changes = [float(x.others[name] - start.others[name]) for name, x in by_numbers.items()]
     sizes = np.concatenate([move_sizes(count), np.full(len(by_logs), LOG_STEP), changes])

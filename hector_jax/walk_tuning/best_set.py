@@ -37,7 +37,13 @@ def drawn_plants(robot: Robot, count: int, first_seed: int = _FIRST_SEED) -> lis
 
 
 def walk_plants(
-    robot: Robot, count: int | None, walks: int | None, commands: int, numbers: int = 0
+    robot: Robot,
+    count: int | None,
+    walks: int | None,
+    commands: int,
+    *,
+    along: int = 0,
+    kept: int = 0,
 ) -> tuple[list[Imperfections], int]:
     """Return the plants of a tuning on walks, and its budget of walks.
 
@@ -46,21 +52,23 @@ def walk_plants(
         count: number of plants, 0 for the hfs itself; None: so that MANY_SETS sets can walk.
         walks: budget; None: that of `best`.
         commands: number of commands.
-        numbers: how many have their slopes by walks.
+        along: number of directions whose slopes are by walks.
+        kept: number of commands to keep.
 
     Raises:
         InputError: the budget is less than two walks in each case, and those for the slopes.
     """
-    first, later = walks_needed(commands, numbers)  # on one plant
+    first, later = (x + kept for x in walks_needed(commands, along))  # on one plant
     if walks is None:
         count = PLANTS if count is None else count
         walks = SETS * max(count, 1) * commands
     elif count is None:
         count = int(np.clip(walks // (first + (MANY_SETS - 1) * later), 1, MOST_PLANTS))
     plants = drawn_plants(robot, count) or [hfs(robot.description)]
-    if 0 < walks < (least := (first + commands) * len(plants)):
-        cases = f"{plural(commands, 'command')} on {plural(len(plants), 'plant')}, twice"
-        cases += f", and with {plural(numbers, 'number')} moved" * (numbers > 0)
+    if 0 < walks < (least := (first + commands + kept) * len(plants)):
+        cases = plural(commands, "command") + f" and {kept} to keep" * (kept > 0)
+        cases += f" on {plural(len(plants), 'plant')}, twice"
+        cases += f", and with {plural(along, 'number')} moved" * (along > 0)
         raise InputError(f"--walks must be 0 or at least {least} ({cases}), got {walks}")
     return plants, walks
 

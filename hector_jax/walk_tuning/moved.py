@@ -1,9 +1,10 @@
-"""Slopes by walks, of the numbers of a user's controller that its legs use.
+"""Slopes by walks: of the numbers of a user's controller that its legs use, and of Q and R.
 
-No plan has them. So a set that is accepted walks again on the same plants with one of them moved;
-the change of the residuals from walk to walk (`changed_by`), divided by the step, is a column of
-the derivative that `curvature.least_squares` takes. In the first set all are moved. A column
-changes little from set to set: later ones move one number, by age and curvature of its column.
+No plan has the former, and without a planner or a twin no model has the latter. So a set that is
+accepted walks again on the same plants with one of them moved, or with a few weights by one factor
+(`GROUPS`); the change of the residuals from walk to walk (`changed_by`), divided by the step, is a
+column of the derivative that `curvature.least_squares` takes. In the first set all are moved. A
+column changes little from set to set: later ones move one, by age and curvature of its column.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,21 +16,57 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.control.parameters import Other, Tunable, name_of
+from hector_jax.control.parameters import Other, Tunable, step_names
 from hector_jax.control.reference import Command
-from hector_jax.control.weights import direction_names, nominal
+from hector_jax.control.weights import Weights, nominal
 from hector_jax.own.walk_file import reference_of
 from hector_jax.own.walk_log import Log, trajectory_of
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.difftune import TuneConfig
 
 STEP = 0.05  # of a number, see `parameters.stepped`; back in every second case
+FACTOR_STEP = 0.2  # [e-folds] of a group of weights
 SPAN = 1.0  # [s] of which the mean of a residual changes as it is: some gait cycles
+GROUPS = (
+    ("Q_roll", "Q_pitch"),
+    ("Q_yaw",),
+    ("Q_x", "Q_y"),
+    ("Q_z",),
+    ("Q_wx", "Q_wy", "Q_wz"),
+    ("Q_vx", "Q_vy", "Q_vz"),
+    ("R_Mx", "R_My", "R_Mz"),
+)
+"""Weights that are moved by one factor. Those of the forces are none: all Q and R by one factor
+change no plan, so they are moved against all others."""
+
+
+class Along(NamedTuple):
+    """A direction of a slope by walks: coordinates that move by one step."""
+
+    name: str
+    at: tuple[int, ...]  # of `parameters.step_names`
+    size: float  # of the step
+
+
+def along_of(like: Weights, others: Sequence[Other], groups: bool) -> list[Along]:
+    """Return the directions of a tuning whose slopes are by walks.
+
+    Args:
+        like: its weights.
+        others: numbers that are tuned.
+        groups: whether those of Q and R are among them.
+    """
+    names = step_names(like, others)
+    members = [[name for name in group if name in names] for group in GROUPS if groups]
+    found = [(group, FACTOR_STEP) for group in members if group]
+    found += [([of.name], STEP) for of in numbers_by_walks(others)]
+    return [Along("+".join(x), tuple(map(names.index, x)), size) for x, size in found]
 
 
 class Moved(NamedTuple):
-    """Walks of a case before and after a number was moved."""
+    """Walks of a case before and after a move."""
 
+    at: tuple[int, ...]  # see `Along`
     step: float
     before: Log
     after: Log
@@ -41,25 +78,24 @@ def numbers_by_walks(others: Iterable[Other]) -> list[Tunable]:
 
 
 class MovedWalks:
-    """The latest walks with each number moved that stood."""
+    """The latest walks along each direction that stood."""
 
-    def __init__(self, others: Sequence[Other]) -> None:
-        self.names, self.numbers = list(map(name_of, others)), numbers_by_walks(others)
-        self.sets: dict[str, int] = {}  # that walked last, by number
-        self.walks: dict[tuple[str, int], Moved] = {}  # by number and case
-        self.curvature = np.zeros(0)  # diagonal of the latest matrix
+    def __init__(self, along: Sequence[Along]) -> None:
+        self.along = along
+        self.sets: dict[str, int] = {}  # that walked last, by direction
+        self.walks: dict[tuple[str, int], Moved] = {}  # by direction and case
+        self.matrix = np.zeros((0, 0))  # the latest one
 
-    def due(self, at: int) -> list[Tunable]:
-        """Return the numbers to move in a set: all, later the one of most age times curvature."""
+    def due(self, at: int) -> Sequence[Along]:
+        """Return the directions of a set: all, later the one of most age times curvature."""
 
-        def urgency(of: Tunable) -> float:
-            place = self.names.index(of.name) - len(self.names)
-            return (at - self.sets[of.name]) * float(self.curvature[place])
+        def urgency(of: Along) -> float:
+            return (at - self.sets[of.name]) * float(self.matrix[np.ix_(of.at, of.at)].sum())
 
-        return [max(self.numbers, key=urgency)] if self.numbers and self.sets else self.numbers
+        return [max(self.along, key=urgency)] if self.along and self.sets else self.along
 
     def of_case(self, case: int) -> dict[str, Moved]:
-        """Return the walks of a case by number."""
+        """Return the walks of a case by direction."""
         return {name: walk for (name, at), walk in self.walks.items() if at == case}
 
 
@@ -68,7 +104,7 @@ def walks_needed(cases: int, numbers: int) -> tuple[int, int]:
 
     Args:
         cases: commands times plants.
-        numbers: how many have their slopes by walks.
+        numbers: how many directions have their slopes by walks.
     """
     return cases * (1 + numbers), cases * (1 + min(numbers, 1))
 
@@ -114,19 +150,19 @@ def columns_by_walks(
     log: Log,
     moved: Mapping[str, Moved],
 ) -> Float[np.ndarray, "rows n"]:
-    """Return the columns of numbers by their walks in a case, and zeros for all other coordinates.
+    """Return the columns by the walks of a case, and zeros for all other coordinates.
 
     Args:
         config, robot, command: of the case.
         log: at which the derivative is wanted.
-        moved: by name of the number.
+        moved: by name of the direction.
     """
     of_log = partial(residuals_of, config, robot, command)
     span, now = round(SPAN / float(log.period)), of_log(log)
-    names = [name_of(x) for x in config.others]
-    J = np.zeros((sum(x.size for x in now), len(direction_names(nominal(robot))) + len(names)))
-    for name, (step, *logs) in moved.items():
+    names = step_names(nominal(robot), config.others)
+    J = np.zeros((sum(x.size for x in now), len(names)))
+    for at, step, *logs in moved.values():
         terms = zip(now, *map(of_log, logs), strict=True)
-        changes = [changed_by(at, before, after, span).ravel() for at, before, after in terms]
-        J[:, names.index(name) - len(names)] = np.concatenate(changes) / step
+        changes = [changed_by(here, before, after, span).ravel() for here, before, after in terms]
+        J[:, at] = np.concatenate(changes)[:, None] / step / len(at)
     return J

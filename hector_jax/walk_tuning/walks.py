@@ -11,7 +11,8 @@ anew in each call and no walk is made twice:
 - `walks.jsonl`: the settings, then a line for each weight set that has walked.
 - `weights/3.json`: the weights of set 3.
 - `logs/3-0.npz`: its log in case 0, at the plan interval, or the file that was added.
-- `logs/3-KP-0.npz`: the same with the number KP moved (`moved`).
+- `logs/3-KP-0.npz`: the same with the number KP moved, or a group of weights (`moved`).
+- `kept/logs/3-0.npz`: the same of a command to keep (`kept`).
 - `starts/with`: the same of a set that was tried as the start.
 """
 
@@ -29,8 +30,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hector_jax.control import parameters
-from hector_jax.control.parameters import Tunable
-from hector_jax.control.reference import standing_anchor
 from hector_jax.control.weights import Weights
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.console import bar, say
@@ -39,20 +38,17 @@ from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.journal import continue_journal, write_rows
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
-from hector_jax.grfm import network
-from hector_jax.own.planner import call_planner, called_plans, plan_inputs
-from hector_jax.own.walk_log import Log, ScoredLog, evaluate_log, log_of, trajectory_of, walker_hash
+from hector_jax.own.walk_log import Log, ScoredLog, evaluate_log, log_of, walker_hash
 from hector_jax.sim.loop import Job
 from hector_jax.store.cache import content_key, robot_hash
 from hector_jax.tuning import difftune
-from hector_jax.tuning.curvature import least_squares_jit
 from hector_jax.tuning.difftune import Iteration, TuneState, step_status
 from hector_jax.tuning.evaluate import Evaluation, Objective
-from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
-from hector_jax.tuning.rollout import Scenario
 from hector_jax.tuning.status import StepStatus
 from hector_jax.walk_tuning.campaign import Campaign
-from hector_jax.walk_tuning.moved import STEP, Moved, MovedWalks, columns_by_walks, numbers_by_walks
+from hector_jax.walk_tuning.kept import Kept, compare_kept
+from hector_jax.walk_tuning.moved import Moved, MovedWalks
+from hector_jax.walk_tuning.slopes import slope_of_walk
 
 RECORD = "walks.jsonl"
 _FALL = 1.0  # log L of a fall above the largest of the start
@@ -64,6 +60,7 @@ class WalkedSet(NamedTuple):
     weights: Weights
     losses: Float[np.ndarray, " cases"]  # L; infinite where the robot fell or a QP was not solved
     accepted: bool  # as a step of the tuning
+    kept: Float[np.ndarray, " walks"] | None = None  # L of the commands to keep; None: not walked
 
     @property
     def fell(self) -> Bool[np.ndarray, " cases"]:
@@ -77,14 +74,26 @@ class WalkTuning(NamedTuple):
     sets: list[WalkedSet]  # the start first
     waiting: Weights | None  # the set whose walks are waited for
     reason: str  # why the tuning ended; empty if it has not
+    keep: tuple[str, ...] = ()  # names of the commands to keep
 
     @property
     def rows(self) -> list[dict[str, Any]]:
         """The sets as JSON values: mean change of log L against the start [%], falls, step."""
-        return [
+        rows = [
             {"change": change, "falls": int(x.fell.sum()), "accepted": x.accepted}
             for change, x in zip(changes(self.sets), self.sets, strict=True)
         ]
+        for number, row in enumerate(rows):
+            if kept := self.kept(number):
+                row["kept"] = {name: x._asdict() for name, x in kept.items()}
+        return rows
+
+    def kept(self, number: int) -> dict[str, Kept]:
+        """Return what a set does to the commands to keep; empty if they have not walked."""
+        start, losses = (self.sets[i].kept for i in (0, number))
+        if start is None or losses is None:
+            return {}
+        return compare_kept(self.keep, start, losses)
 
     @property
     def best(self) -> int:
@@ -126,42 +135,9 @@ def walk_case(campaign: Campaign, weights: Weights, case: int) -> ScoredLog:
     return evaluate_log(config, robot, command, log)
 
 
-def _slope(
-    campaign: Campaign,
-    weights: Weights,
-    case: int,
-    log: Log,
-    moved: Mapping[str, Moved] = {},
-) -> tuple[Evaluation, Float[np.ndarray, "n n"]] | InputError:
-    """Return loss, gradient and matrix of the plain rigid body grounded on a walk.
-
-    By the numbers that were `moved` they are by walks, see `columns_by_walks`. If the planner of
-    the user gives no plans of it this returns its error: others may go on.
-    """
-    config, robot = campaign.config, campaign.robot
-    effect = network.effect_of(None, config.rollout.walk)
-    scenario = Scenario(robot, campaign.cases[case][1], standing_anchor(robot), effect)
-    walk, called = trajectory_of(log), None
-    if campaign.planner is not None:
-        controller = config.rollout.walk
-        inputs = plan_inputs(controller, robot, weights, scenario.command, walk)
-        try:
-            plans = partial(call_planner, campaign.planner)
-            numbers = [x for x in config.others if isinstance(x, Tunable) and not x.of_legs]
-            called = called_plans(plans, controller, inputs, numbers)
-        except InputError as error:
-            return error
-    grounding = fit_grounding(config.rollout, scenario, weights, walk, called=called)
-    options: dict[str, Any] = {"walk": grounded_rollout, "others": config.others}
-    if numbers_by_walks(config.others):
-        options["columns"] = columns_by_walks(config, robot, scenario.command, log, moved)
-    found = least_squares_jit(config.rollout, grounding, weights, config.loss, **options)
-    return jax.device_get(found)
-
-
 def first_slope(campaign: Campaign) -> None:
     """Compile the programs of the tuning, of which this walk is none, into the cache."""
-    _slope(campaign, campaign.start, 0, walk_case(campaign, campaign.start, 0).log)
+    slope_of_walk(campaign, campaign.start, 0, walk_case(campaign, campaign.start, 0).log)
 
 
 # The objective
@@ -183,9 +159,10 @@ class _Walks:
     ) -> None:
         self.pool, self.campaign, self.ask = pool, campaign, ask
         self.losses: list[np.ndarray] = []
+        self.kept: dict[int, np.ndarray] = {}  # by set
         self.left = np.inf if walks is None else walks
         self.state: TuneState | None = None
-        self.moved = MovedWalks(campaign.config.others)
+        self.moved = MovedWalks(campaign.along)
 
     def place(self, state: TuneState) -> TuneState:
         """Return the state at the set that has walked, should the code place it elsewhere.
@@ -193,7 +170,7 @@ class _Walks:
         Raises:
             Spent: it cannot walk.
         """
-        if self.left < len(self.campaign.cases):
+        if self.left < self.campaign.set_walks:
             raise Spent
         self.state = self._placed(state)
         return self.state
@@ -222,17 +199,18 @@ class _Walks:
         stood = np.isfinite(losses)
         self.losses.append(losses)
         value = float(np.exp(bounded_logs(losses, self.losses[0]).mean()))
-        gains, refused = (
-            self._gains(weights, value),
-            stood.sum() < np.isfinite(self.losses[0]).sum(),
-        )
+        gains = self._gains(weights, value)
+        refused = stood.sum() < np.isfinite(self.losses[0]).sum()
+        refused = refused or bool(gains and stood.any() and self._breaks(weights))
         # a slope takes as long as a walk
         on = np.flatnonzero(stood).tolist() if gains and not refused else []
         some = [logs[case].log for case in on]
         if on:
             self._move(weights, dict(zip(on, some, strict=True)))
         moved = [self.moved.of_case(case) for case in on]
-        found = list(self.pool.map(_slope, repeat(campaign), repeat(weights), on, some, moved))
+        found = list(
+            self.pool.map(slope_of_walk, repeat(campaign), repeat(weights), on, some, moved)
+        )
         errors = [x for x in found if isinstance(x, InputError)]
         if errors and len(errors) == len(found) and not number:
             raise errors[0]
@@ -251,7 +229,7 @@ class _Walks:
         if usable:
             gradient, matrix = mean([(found.gradient, curved) for found, curved in usable])
             residual = np.max([found.residual for found, _ in usable])
-            self.moved.curvature = np.diag(matrix)
+            self.moved.matrix = matrix
         return Evaluation(np.asarray(value), {}, gradient, fallen, np.asarray(residual)), matrix
 
     def _gains(self, weights: Weights, value: float) -> bool:
@@ -263,24 +241,39 @@ class _Walks:
         status = difftune.trial_status(self.campaign.config, self.state, found)
         return int(status) == StepStatus.ACCEPTED
 
+    def _breaks(self, weights: Weights) -> bool:
+        """Walk the commands to keep; return whether one is worse than with the start."""
+        if not self.campaign.kept:
+            return False
+        one, number = self.campaign.of_kept, len(self.losses) - 1
+        losses = np.array([walked.loss for walked in walk_all(self.pool, one, number, weights)])
+        self.left -= len(losses)
+        self.kept[number] = losses
+        found = compare_kept([*one.commands], self.kept[0], losses)
+        return any(x.broken for x in found.values())
+
     def _move(self, weights: Weights, stood: Mapping[int, Log]) -> None:
-        """Walk a set again with numbers moved, unless no walks are left for a set after that."""
+        """Walk a set again along the directions, unless no walks are left for a set after that."""
         campaign, number = self.campaign, len(self.losses) - 1
         due = self.moved.due(number)
-        if self.left < len(due) * len(stood) + len(campaign.cases):
+        if self.left < len(due) * len(stood) + campaign.set_walks:
             return
         self.left -= len(due) * len(stood)
         back = {c for c in stood if (c + c // len(campaign.commands)) % 2}
-        nudges = {
-            (of.name, case): parameters.nudged(weights, of, -STEP if case in back else STEP)
-            for of, case in product(due, stood)
+        each, others = list(product(due, stood)), campaign.config.others
+        nudges = [
+            parameters.nudged(weights, others, of.at, -of.size if case in back else of.size)
+            for of, case in each
+        ]
+        sets = {
+            (f"{number}-{of.name}", case): x
+            for (of, case), (x, _) in zip(each, nudges, strict=True)
         }
-        sets = {(f"{number}-{name}", case): x for (name, case), (x, _) in nudges.items()}
         found = walk_sets(self.pool, campaign, sets).values()
-        for ((name, case), (_, step)), walked in zip(nudges.items(), found, strict=True):
-            self.moved.sets[name] = number
+        for (of, case), (_, step), walked in zip(each, nudges, found, strict=True):
+            self.moved.sets[of.name] = number
             if np.isfinite(walked.loss):
-                self.moved.walks[name, case] = Moved(step, stood[case], walked.log)
+                self.moved.walks[of.name, case] = Moved(of.at, step, stood[case], walked.log)
 
 
 def tune_on_walks(
@@ -308,15 +301,19 @@ def tune_on_walks(
         config = replace(config, iterations=max(walks // cases - 1, 1))
     objective = _Walks(pool, campaign, ask or partial(walk_all, pool, campaign), walks)
     sets: list[WalkedSet] = []
+    keep = tuple(campaign.kept)
     with bar(f"tuning on walks, {plural(cases, 'case')}") as report_progress:
 
         def write_record() -> None:
-            rows = ({"losses": x.losses.tolist(), "accepted": x.accepted} for x in sets)
+            rows = [{"losses": x.losses.tolist(), "accepted": x.accepted} for x in sets]
+            for row, x in zip(rows, sets, strict=True):
+                row |= {} if x.kept is None else {"kept": x.kept.tolist()}
             write_rows(campaign.folder / RECORD, [head, *rows])
 
         def on_iteration(iteration: Iteration) -> None:
             losses = objective.losses[-1]
-            sets.append(WalkedSet(iteration.weights, losses, bool(iteration.accepted)))
+            kept = objective.kept.get(len(sets))
+            sets.append(WalkedSet(iteration.weights, losses, bool(iteration.accepted), kept))
             write_record()
             best = WalkTuning(sets, None, "").best
             remark = f"L {changes(sets)[best] or 0.0:+.0f} % against the start"
@@ -329,14 +326,16 @@ def tune_on_walks(
         except Waiting:
             write_record()  # without sets whose logs were taken back
             waiting = load_weights(weights_path(campaign.folder, len(sets)), campaign.robot)
-            return WalkTuning(sets, waiting, "")
+            return WalkTuning(sets, waiting, "", keep)
         except Spent:
-            return WalkTuning(sets, None, f"no more of its {plural(walks or 0, 'walk')} are left")
+            reason = f"no more of its {plural(walks or 0, 'walk')} are left"
+            return WalkTuning(sets, None, reason, keep)
         except InputError:
             if sets and not sets[0].accepted:
-                return WalkTuning(sets, None, "the start fell or was not solved in all walks")
+                reason = "the start fell or was not solved in all walks"
+                return WalkTuning(sets, None, reason, keep)
             raise
-    return WalkTuning(sets, None, tuning.reason)
+    return WalkTuning(sets, None, tuning.reason, keep)
 
 
 def remedy(campaign: Campaign) -> str:
@@ -360,6 +359,8 @@ def record_head(campaign: Campaign) -> dict[str, Any]:
     settings = replace(campaign.config, iterations=1)  # with a larger budget it goes on
     return head | {
         "robot": robot_hash(campaign.robot),
+        "slopes": "walks" if campaign.groups else "plans",
+        "kept": {name: tree_hash(command) for name, command in campaign.kept.items()},
         "settings": content_key(settings, campaign.start, code=()),
         "engine": campaign.engine.key,
         "code": code_hash("walk_tuning.walks", *campaign.engine.modules),
