@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 from compiled import CONFIG, TUNED, WARNINGS, assert_same, needs_cc, source_of
-from model import OTHERS, ROBOT
+from model import OTHERS, QUADRUPED, ROBOT
 
 from hector_jax.control.contact import (
     BOX_FRICTION,
@@ -22,6 +22,7 @@ from hector_jax.control.contact import (
     LINE_FRICTION,
     TWIST,
 )
+from hector_jax.control.controller import walk_config
 from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal
@@ -221,6 +222,42 @@ def held(tmp_path_factory):
     words += ["controller.c", *libraries, f"-Wl,-rpath,{home}", "-lm", "-o", "held"]
     subprocess.run(words, cwd=folder, check=True)
     return folder / "held"
+
+
+def run_calls(folder, program, robot, *words):
+    """The output of exported_PROGRAM.c with a robot's controller and a file of how it stands."""
+    needs_cc()
+    file = HERE / f"exported_{program}.c"
+    source = source_of(nominal(robot), walk_config(robot), robot)
+    for name, text in source.items():
+        write_file(folder / name, text.encode())
+    estimates = np.zeros(100, check.layout_of(robot).estimate)
+    estimates["position"] = robot.com_offset + np.array([0.0, 0.0, robot.trunk_height])
+    estimates["joints"] = robot.standing_joints
+    estimates.tofile(folder / "estimates")
+    own = [] if "controller.c" in file.read_text() else ["controller.c"]
+    flags = "cc -std=c99 -O2 -Wall -Wextra -Werror -I. -o program".split()
+    subprocess.run([*flags, file, *own, "-lm"], cwd=folder, check=True)
+    words = ["./program", *words, "estimates"]
+    said = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    assert (said.returncode, said.stderr) == (0, ""), said.stdout
+    return said.stdout
+
+
+@pytest.mark.parametrize("robot", [ROBOT, QUADRUPED], ids=["hector", "quadruped"])
+def test_random_calls_break_no_rule(tmp_path, robot):
+    """No torque beyond its limit, no wrench outside its rows, no trace of a refused call."""
+    said = run_calls(tmp_path, "fuzz", robot, "20000", "1")
+    for kind, seen in (("calls", (0, 1, 6, 8)), ("plans", (0, 1))):
+        counts = [int(x) for x in re.search(rf"{kind} by status (.*)", said)[1].split()]
+        assert all(counts[status] > 100 for status in seen)
+    assert float(re.search("outermost wrench (.*)", said)[1]) <= 1e-9
+
+
+@pytest.mark.parametrize("robot", [ROBOT, QUADRUPED], ids=["hector", "quadruped"])
+def test_a_push_delays_no_call_that_holds(tmp_path, robot):
+    said = run_calls(tmp_path, "time", robot)
+    assert float(re.search(r"push: hold \S+ (\S+)", said)[1]) < 0.05  # [ms]
 
 
 HOLDS = [("stand", s, up) for s in (2, 5, 10, 30) for up in (0.02, 0.05, 0.15)]
