@@ -532,8 +532,8 @@ def run(tmp_path):
 
 def test_the_command_writes_files_that_run_without_us(capsys, exported):
     card, folder = exported
-    files = "CMakeLists.txt check.npz controller.c controller.h controller.json weights.cpp"
-    names = [*files.split(), "ros2_control", "weights.json", SCHEMA]
+    files = "CMakeLists.txt check.npz controller.c controller.h controller.json ros2_control"
+    names = [*files.split(), "weights.cpp", "weights.json", SCHEMA]
     assert sorted(path.name for path in folder.glob("[!.]*")) == names
     assert json.loads((folder / "controller.json").read_text()) == card
     assert card["check"]["force"] <= 1e-8

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
+import jax
 import mujoco
 import numpy as np
 import pytest
@@ -163,6 +164,11 @@ def test_the_header_says_the_size_the_stack_and_where_it_is_from(library):
         1
     ].splitlines():
         assert not line or re.search(r"/\* .*\[\S+\].* \*/", line)
+
+
+def test_the_source_has_all_digits_in_single_precision_too(library):
+    with jax.enable_x64(False):
+        assert source_of(TUNED)["controller.c"] == (library.parent / "controller.c").read_text()
 
 
 CONSUMER = """cmake_minimum_required(VERSION 3.15)
