@@ -52,6 +52,9 @@ int test_time(void) {
     CHECK(step(5007, &e) == CONTROLLER_SOLVED && out.age == 7);
     CHECK(step(5006, &e) == CONTROLLER_BAD_INPUT); /* the clock goes back */
     CHECK(step(5038, &e) == CONTROLLER_SOLVED && out.age == 8); /* calls were late: time went on */
+    CHECK(step(5038 - CONTROLLER_MAX_AGE, &e) == CONTROLLER_BAD_INPUT);
+    CHECK(step(5037 - CONTROLLER_MAX_AGE, &e) == CONTROLLER_UNSAFE && out.torque[3] == 0.0);
+    CHECK(step(INT64_MIN, &e) == CONTROLLER_UNSAFE && step(5039, &e) == CONTROLLER_SOLVED);
     return 0;
 }
 
@@ -190,7 +193,9 @@ int test_imu(void) { /* a pitch of 0.3 rad, a gyro about the trunk's own z */
     const double half = 0.15, q[4] = { cos(half), 0, sin(half), 0 }, gyro[3] = { 0, 0, 2.0 };
     const double origin[3] = { 1, 2, 0.5 }, velocity[3] = { 0.1, 0, 0 }, none[4] = { 0 };
     struct controller_estimate e = standing();
+    controller_init(&c);
     CHECK(controller_from_imu(none, gyro, origin, velocity, &e) == CONTROLLER_BAD_INPUT);
+    CHECK(step(0, &e) == CONTROLLER_BAD_INPUT);
     CHECK(controller_from_imu(q, gyro, origin, velocity, &e) == CONTROLLER_SOLVED);
     CHECK(fabs(e.euler[0]) + fabs(e.euler[1] - 0.3) + fabs(e.euler[2]) < 1e-12);
     CHECK(fabs(e.ang_velocity[0] - 2.0 * sin(0.3)) + fabs(e.ang_velocity[2] - 2.0 * cos(0.3)) < 1e-12);

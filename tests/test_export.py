@@ -41,6 +41,7 @@ from hector_jax.control.reference import Command, named_command
 from hector_jax.control.weights import nominal
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.console import Broken
+from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import to_table
 from hector_jax.core.trajectory import State, pack_wrench
@@ -350,9 +351,9 @@ def test_two_exports_in_one_program_keep_their_numbers(tmp_path, shared):
     (tmp_path / "main.c").write_text(BOTH)
     linked = []
     for name, weights in both.items():
-        (folder := tmp_path / name).mkdir()
+        folder = tmp_path / name
         for file, text in {**source_of(weights), "own.c": OWN_Q}.items():
-            (folder / file).write_text(text)
+            write_file(folder / file, text.encode())
         words = f"cc -std=c99 -fPIC -DWHOSE={name}"
         if shared:
             linked.append(f"{name}/own.so")
@@ -531,8 +532,8 @@ def run(tmp_path):
 
 def test_the_command_writes_files_that_run_without_us(capsys, exported):
     card, folder = exported
-    files = "CMakeLists.txt check.npz controller.c controller.h controller.json weights.cpp"
-    names = [*files.split(), "weights.json", SCHEMA]
+    files = "CMakeLists.txt check.npz controller.c controller.h controller.json ros2_control"
+    names = [*files.split(), "weights.cpp", "weights.json", SCHEMA]
     assert sorted(path.name for path in folder.glob("[!.]*")) == names
     assert json.loads((folder / "controller.json").read_text()) == card
     assert card["check"]["force"] <= 1e-8

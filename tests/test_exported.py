@@ -1,17 +1,21 @@
 """The C controller in programs of others: its calls, compilers, CMake, a robot that is held."""
 
 import ctypes
+import json
 import os
 import re
 import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree
 
+import jax
 import mujoco
+import numpy as np
 import pytest
 from compiled import CONFIG, TUNED, WARNINGS, assert_same, needs_cc, source_of
-from model import OTHERS, ROBOT
+from model import OTHERS, QUADRUPED, ROBOT
 
 from hector_jax.control.contact import (
     BOX_FRICTION,
@@ -19,11 +23,13 @@ from hector_jax.control.contact import (
     LINE_FRICTION,
     TWIST,
 )
+from hector_jax.control.controller import walk_config
 from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import best
 from hector_jax.core.environment import versions
+from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.export import check
@@ -63,12 +69,45 @@ def test_calls_of_the_controller(own_tests, name):
     assert getattr(own_tests, f"test_{name}")() == 0
 
 
+def test_the_plug_in_of_ros2_control_walks_as_the_controller_does(tmp_path):
+    """With stand-ins of the headers of ROS, in MuJoCo: also parameters, watchdog, lost inputs."""
+    needs_cc()
+    home = Path(mujoco.__path__[0])
+    if shutil.which("g++") is None or not list(home.glob("libmujoco.so*")):
+        pytest.skip("there is no C++ compiler or no libmujoco.so")
+    own = (HERE / "exported_ros2.cpp").read_text()
+    for file, text in with_prefix(source_of(best()) | {"test.cpp": own}, "left").items():
+        write_file(tmp_path / file, text.encode())
+    folder = tmp_path / "ros2_control"
+    flags = f"-std=c++17 -O2 -Wall -Wextra -Werror -I. -I{HERE}/ros2 -I{home}/include"
+    linked = [*home.glob("libmujoco.so*"), f"-Wl,-rpath,{home}"]
+    files = "test.cpp ros2_control/left_ros2.cpp left.o -o ros2"
+    subprocess.run("cc -std=c99 -O2 -c left.c".split(), cwd=tmp_path, check=True)
+    words = ["g++", *flags.split(), *files.split(), *linked]
+    subprocess.run(words, cwd=tmp_path, check=True)
+    words = [tmp_path / "ros2", ROBOT.description.model]
+    said = subprocess.run(words, capture_output=True, text=True)
+    assert (said.returncode, said.stderr) == (0, ""), said.stdout
+    x, y, height = map(float, re.search(r"x (\S+) y (\S+) height (\S+)", said.stdout).groups())
+    assert (x, y, height) == pytest.approx((0.5, 0.28, ROBOT.standing_height), abs=0.1)
+    (kind,) = ElementTree.parse(folder / "plugins.xml").getroot()
+    assert (kind.get("type"), kind.get("name")) == ("left_ros2::Walk", "left_ros2/Walk")
+    assert ElementTree.parse(folder / "package.xml").findtext("name") == "left_ros2"
+    assert "project(left_ros2 " in (folder / "CMakeLists.txt").read_text()
+    text = (folder / "parameters.yaml").read_text()
+    given = dict(re.findall(r"^    (\w+): (.*)$", text, re.MULTILINE))
+    assert (given["type"], json.loads(given["R_force"])) == (
+        "left_ros2/Walk",
+        np.ravel(best().R.force).tolist(),
+    )
+
+
 def test_two_exports_with_prefixes_are_used_by_one_file(tmp_path):
     needs_cc()
     both = {"left": TUNED, "right": CONFIG.with_others(nominal(), OTHERS)}
     for prefix, weights in both.items():
         for file, text in with_prefix(source_of(weights), prefix).items():
-            (tmp_path / file).write_text(text)
+            write_file(tmp_path / file, text.encode())
     code = """#include "left.h"
     #include "right.h"
     static struct left a;
@@ -125,6 +164,11 @@ def test_the_header_says_the_size_the_stack_and_where_it_is_from(library):
         1
     ].splitlines():
         assert not line or re.search(r"/\* .*\[\S+\].* \*/", line)
+
+
+def test_the_source_has_all_digits_in_single_precision_too(library):
+    with jax.enable_x64(False):
+        assert source_of(TUNED)["controller.c"] == (library.parent / "controller.c").read_text()
 
 
 CONSUMER = """cmake_minimum_required(VERSION 3.15)
@@ -184,6 +228,42 @@ def held(tmp_path_factory):
     words += ["controller.c", *libraries, f"-Wl,-rpath,{home}", "-lm", "-o", "held"]
     subprocess.run(words, cwd=folder, check=True)
     return folder / "held"
+
+
+def run_calls(folder, program, robot, *words):
+    """The output of exported_PROGRAM.c with a robot's controller and a file of how it stands."""
+    needs_cc()
+    file = HERE / f"exported_{program}.c"
+    source = source_of(nominal(robot), walk_config(robot), robot)
+    for name, text in source.items():
+        write_file(folder / name, text.encode())
+    estimates = np.zeros(100, check.layout_of(robot).estimate)
+    estimates["position"] = robot.com_offset + np.array([0.0, 0.0, robot.trunk_height])
+    estimates["joints"] = robot.standing_joints
+    estimates.tofile(folder / "estimates")
+    own = [] if "controller.c" in file.read_text() else ["controller.c"]
+    flags = "cc -std=c99 -O2 -Wall -Wextra -Werror -I. -o program".split()
+    subprocess.run([*flags, file, *own, "-lm"], cwd=folder, check=True)
+    words = ["./program", *words, "estimates"]
+    said = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    assert (said.returncode, said.stderr) == (0, ""), said.stdout
+    return said.stdout
+
+
+@pytest.mark.parametrize("robot", [ROBOT, QUADRUPED], ids=["hector", "quadruped"])
+def test_random_calls_break_no_rule(tmp_path, robot):
+    """No torque beyond its limit, no wrench outside its rows, no trace of a refused call."""
+    said = run_calls(tmp_path, "fuzz", robot, "20000", "1")
+    for kind, seen in (("calls", (0, 1, 6, 8)), ("plans", (0, 1))):
+        counts = [int(x) for x in re.search(rf"{kind} by status (.*)", said)[1].split()]
+        assert all(counts[status] > 100 for status in seen)
+    assert float(re.search("outermost wrench (.*)", said)[1]) <= 1e-9
+
+
+@pytest.mark.parametrize("robot", [ROBOT, QUADRUPED], ids=["hector", "quadruped"])
+def test_a_push_delays_no_call_that_holds(tmp_path, robot):
+    said = run_calls(tmp_path, "time", robot)
+    assert float(re.search(r"push: hold \S+ (\S+)", said)[1]) < 0.05  # [ms]
 
 
 HOLDS = [("stand", s, up) for s in (2, 5, 10, 30) for up in (0.02, 0.05, 0.15)]

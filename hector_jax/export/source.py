@@ -1,7 +1,8 @@
 """The controller as C: `controller.c` and `controller.h` from a configuration and a robot.
 
 The templates are the C program: vectors, gait, reference, torques and interface in `controller`,
-then `legs`, `qp` and `mpc`. What is filled in are sizes, tables and the constraints in use.
+then `legs`, `qp` and `mpc`; in `ros2_control` a package of ROS 2 around it. What is filled in are
+sizes, tables and the constraints in use.
 """
 
 import hashlib
@@ -82,7 +83,7 @@ def controller_source(
     pieces: int = 0,
     measured: str = "not measured",
 ) -> dict[str, str]:
-    """Return `controller.c`, `controller.h` and their `CMakeLists.txt` by their names.
+    """Return the texts of FILES by their names.
 
     Args:
         config, robot, weights: the controller.
@@ -120,7 +121,7 @@ def controller_source(
     }
 
     def render(**others: str) -> dict[str, str]:
-        known = {**values, "c": _c, "names": _NAMES, **others}
+        known = {**values, "c": _c, "yaml": _yaml, "names": _NAMES, **others}
         return {f: _TEMPLATES.get_template(f"{f}.j2").render(known) for f in FILES}
 
     # named by what they are: another export has other names in a program that links both
@@ -143,7 +144,8 @@ def _constraints(config: WalkConfig) -> list[str]:
     return [str(part) for part in parts]
 
 
-FILES = ("controller.h", "controller.c", "CMakeLists.txt")
+ROS2 = "controller_ros2.cpp CMakeLists.txt package.xml plugins.xml parameters.yaml".split()
+FILES = ("controller.h", "controller.c", "CMakeLists.txt", *(f"ros2_control/{f}" for f in ROS2))
 _NAMES = "size exported lower upper init reset set_tunables set_max_changes drive from_imu".split()
 _NAMES += ["plan", "hold", "step", "step_at"]
 
@@ -156,7 +158,7 @@ def with_prefix(source: dict[str, str], prefix: str) -> dict[str, str]:
     """
     if not re.fullmatch("[a-z][a-z0-9_]*", prefix):
         raise InputError(f"--prefix must be a name in C in small letters, got {prefix!r}")
-    names = r"\bcontroller(?=_|\.[ch]\b)|(?<=struct )controller\b"
+    names = r"\bcontroller(?=_(?!interface|manager)|\.[ch]\b)|(?<=struct )controller\b"
 
     def rename(text: str, names: str = names) -> str:
         return re.sub(r"\bCONTROLLER(?=_)", prefix.upper(), re.sub(names, prefix, text))
@@ -172,6 +174,12 @@ def _c(value: Any) -> str:
     if np.ndim(value):
         return "{ " + ", ".join(map(_c, value)) + " }"
     return "HUGE_VAL" if value == np.inf else repr(np.asarray(value).item())
+
+
+def _yaml(values: np.ndarray) -> str:
+    """Return an array as a list of YAML, where 1e-5 would be text."""
+    numbers = (np.format_float_positional(x, trim="0") for x in values.ravel())
+    return f"[{', '.join(numbers)}]".replace("inf", ".inf")
 
 
 def _numbers(config: WalkConfig, robot: Robot) -> dict[str, Any]:
