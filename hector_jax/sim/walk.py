@@ -276,6 +276,11 @@ class Stepper:
         """The coordinates now, see `sensing.Reading`."""
         return self._readings[len(self._plans) * self.count]
 
+    @property
+    def last_plan(self) -> Plan:
+        """The plan of the last tick (numpy)."""
+        return unpack(self._plan_layout, np.asarray(self._packed))[1]
+
     def tick(self, errors: Float[np.ndarray, "n errors"], forces: Float[np.ndarray, "n 3"]) -> None:
         """Plan, and step the plant to the next plan.
 
