@@ -53,7 +53,7 @@ class LiveWalk:
 
     @quiet_mujoco()
     def __init__(self, config: WalkConfig, robot: Robot, job: Job, payload: float = 0.0) -> None:
-        """Stand at the start of a walk; a `payload` [kg] sits in the trunk's centre of mass."""
+        """Walk the first tick from standing; a `payload` [kg] sits in the trunk's centre of mass."""
         self._config, self._robot, self.job, self.fall = config, robot, job, ""
         length = round(BLOCK * config.gait.tick / TIME_STEP)
         self._plant = MujocoPlant(job, robot, 0, length, on_step=self._log_step)
@@ -67,6 +67,7 @@ class LiveWalk:
         joints, noise = len(robot.joint_lower), job.imperfections.estimator
         self._errors = sensing.draw_errors(noise, joints, job.seed, self._lead, _NOISE)
         self._push, self._pushed, self._pending = np.zeros(3), 0, 0
+        self.tick()  # so that there is a plan
 
     @property
     def anchor(self) -> Anchor:
@@ -77,6 +78,11 @@ class LiveWalk:
     def clock(self) -> int:
         """The next gait tick."""
         return self._stepper.clock
+
+    @property
+    def sampled_to(self) -> int:
+        """The gait tick after the last of `trajectory`."""
+        return self.clock - self._pending
 
     def tick(self) -> None:
         """Walk to the next plan; nothing after a fall."""
