@@ -18,6 +18,7 @@ from jaxtyping import Float
 from hector_jax.control.controller import WalkConfig, walk_config
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights
+from hector_jax.control.weights_file import weights_tree
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.robot.model import Robot
 from hector_jax.sim.live import WINDOW, LiveWalk, Now
@@ -62,7 +63,8 @@ class Session:
         self.config: WalkConfig = walk_config(robot)
         self.robot, self.speed, self.running, self._payload = robot, 1.0, True, 0.0
         self._jobs = list(jobs)
-        self._first, self._starts = [job.weights for job in jobs], [None for _ in jobs]
+        self._first = [job.weights for job in jobs]
+        self._starts: list[Float[np.ndarray, 6] | None] = [None for _ in jobs]
         self._steady = [0 for _ in jobs]  # ticks since weights, command or plant changed
         self.walks: list[LiveWalk] = []
         self.reset()
@@ -109,7 +111,7 @@ class Session:
 
     def set_weights(self, i: int, weights: Weights) -> None:
         """Give set `i` other weights."""
-        same = jax.tree.all(jax.tree.map(np.array_equal, weights, self._first[i]))
+        same = weights_tree(weights) == weights_tree(self._first[i])
         self._jobs[i] = self._jobs[i]._replace(weights=self._first[i] if same else weights)
         self.walks[i].set_job(self.walks[i].job._replace(weights=self._jobs[i].weights))
         self._steady[i] = 0
@@ -160,9 +162,9 @@ def count_compilations() -> Callable[[], int]:
     """Return a function that tells how many programs this process has compiled or loaded since."""
     found = []
 
-    def listen(name: str, seconds: float, **about: Any) -> None:
-        if name == _COMPILED:
-            found.append(seconds)
+    def listen(event: str, duration_secs: float, **_: Any) -> None:
+        if event == _COMPILED:
+            found.append(duration_secs)
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     return lambda: len(found)

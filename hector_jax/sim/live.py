@@ -46,6 +46,7 @@ class Now(NamedTuple):
     fall: str  # time and likeliest cause; empty while it walks
     seconds: float  # that the errors are of; 0 before t = 0
     errors: Float[np.ndarray, "6"]  # RMS: x, y, z [cm], roll, pitch, yaw [degrees]
+    error: Float[np.ndarray, "6"]  # at the last sample
 
 
 class LiveWalk:
@@ -53,7 +54,7 @@ class LiveWalk:
 
     @quiet_mujoco()
     def __init__(self, config: WalkConfig, robot: Robot, job: Job, payload: float = 0.0) -> None:
-        """Walk the first tick from standing; a `payload` [kg] sits in the trunk's centre of mass."""
+        """Walk the first tick from standing; a `payload` [kg] sits in the trunk's centre."""
         self._config, self._robot, self.job, self.fall = config, robot, job, ""
         length = round(BLOCK * config.gait.tick / TIME_STEP)
         self._plant = MujocoPlant(job, robot, 0, length, on_step=self._log_step)
@@ -62,7 +63,8 @@ class LiveWalk:
         self.set_plant(job, payload)
         self._ticks = round(WINDOW / config.gait.tick)
         self._blocks: deque[tuple[Plan, Sample]] = deque()  # at least WINDOW and a tick
-        self._squares: deque[np.ndarray] = deque(maxlen=self._ticks)  # of errors, by tick from t = 0
+        self._away = np.full((1, 6), np.nan)  # errors of the last samples
+        self._squares: deque[np.ndarray] = deque(maxlen=self._ticks)  # of errors, from t = 0
         self._lead = (job.start_tick - first_tick(config)) * self._stepper.count
         joints, noise = len(robot.joint_lower), job.imperfections.estimator
         self._errors = sensing.draw_errors(noise, joints, job.seed, self._lead, _NOISE)
@@ -140,6 +142,7 @@ class LiveWalk:
         away = np.hstack([samples.state.position, samples.state.euler])
         away -= np.hstack([samples.reference.position, samples.reference.euler])
         away *= [100.0] * 3 + [np.degrees(1.0)] * 3
+        self._away = away
         squares = (away**2).reshape(len(plans.residual), count, 6)
         first = self.clock - len(plans.residual) - self.job.start_tick
         self._squares.extend(squares[max(-first, 0) :] if not samples.fallen.any() else ())
@@ -175,7 +178,8 @@ class LiveWalk:
             errors = np.sqrt(np.mean(self._squares, axis=(0, 1)))
         planned = stepper.last_plan
         tick = self._config.gait.tick
-        reference = reference_at(tick, with_pieces(self.job.command), self.anchor, float(self.clock))
+        command = with_pieces(self.job.command)
+        reference = reference_at(tick, command, self.anchor, float(self.clock))
         return Now(
             time=(self.clock - self.job.start_tick) * tick,
             pose=np.concatenate([reading.pose, reading.joints + reading.slack]),
@@ -187,4 +191,5 @@ class LiveWalk:
             fall=self.fall,
             seconds=len(self._squares) * tick,
             errors=errors,
+            error=self._away[-1],
         )
