@@ -17,8 +17,9 @@ from hector_jax.core.inputs import InputError, require_package
 from hector_jax.core.runtime import start_process, workers
 from hector_jax.report.live import simulate
 from hector_jax.report.live_tuning import Tuner
+from hector_jax.report.live_weights import Setup
 from hector_jax.report.view import opened_server
-from hector_jax.report.view_live import Setup, serve_live
+from hector_jax.report.view_live import serve_live
 from hector_jax.robot.model import Robot, compile_model, load_robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import WORLDS, named_world
@@ -55,7 +56,9 @@ def run_live(args: View) -> None:
         return shlex.join([*words, "--world", world, "--seed", str(seed)])
 
     model = compile_model(robot.description)
-    setup = Setup(robot, model, sets, _named(robot), args.world, args.seed, line)
+    setup = Setup(
+        robot, model, sets, list(args.weights), _named(robot), args.world, args.seed, line
+    )
     here, there = Pipe()
     with workers(1) as pool, opened_server(args.host, args.port) as (server, address):
         process = start_process(simulate, there, jax.tree.map(np.asarray, robot), jobs)

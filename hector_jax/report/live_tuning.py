@@ -17,6 +17,7 @@ from hector_jax.control import parameters
 from hector_jax.control.reference import with_pieces
 from hector_jax.control.weights import Weights
 from hector_jax.control.weights_file import weights_tree
+from hector_jax.core.inputs import InputError
 from hector_jax.grfm import network
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.report.live import Walked
@@ -149,6 +150,8 @@ class Tuner:
         if self._running is None or not self._running[0].done():
             return None
         (job, what, i), self._running = self._running, None
+        if isinstance(error := job.exception(), InputError):
+            return Found(str(error), i)
         if what == "matter":
             return Found(job.result(), i)
         state, weights, text = job.result()

@@ -5,36 +5,24 @@ robots walk in another process (`report.live`). Weights are moved as a tuning mo
 logarithms and with one weight for all feet.
 """
 
-import re
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
-from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.control.parameters import bounds
-from hector_jax.control.weights import (
-    Weights,
-    direction_names,
-    directions,
-    scale_weights,
-    weights_to_vector,
-)
-from hector_jax.control.weights_file import save_weights
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import FEET, SOLVED
 from hector_jax.report.live import Frame, Walked
 from hector_jax.report.live_tuning import Tuner
+from hector_jax.report.live_weights import Setup, WeightsPanel
 from hector_jax.report.motion import INK
 from hector_jax.report.plots.style import rgb_of
 from hector_jax.report.view_parts import add_floor, body_meshes, plot
-from hector_jax.robot.model import Robot
 from hector_jax.sim.live import PUSH_TIME, WINDOW, Now
 from hector_jax.sim.world import MAX_DELAY, WORLDS, Imperfections, named_world
 
@@ -43,26 +31,6 @@ _SLOW = 0.95  # share of the wanted speed below which the machine is too slow
 _ARROW = 5 / 6  # length of an arrow for the robot's weight, as a share of its height
 _SIDES = {"from behind": (1, 0), "from ahead": (-1, 0), "from the right": (0, 1)}
 _SIDES |= {"from the left": (0, -1)}
-_GROUPS = {  # beginnings of names, and units of the weights: 1 / square of
-    "Orientation": (("Q_roll", "Q_pitch", "Q_yaw"), "rad"),
-    "Position": (("Q_x", "Q_y", "Q_z"), "m"),
-    "Turning rates": (("Q_wx", "Q_wy", "Q_wz"), "rad/s"),
-    "Velocity": (("Q_vx", "Q_vy", "Q_vz"), "m/s"),
-    "Forces of the feet": (("R_Fx", "R_Fy", "R_Fz"), "N"),
-    "Moments of the feet": (("R_Mx", "R_My", "R_Mz"), "N m"),
-}
-
-
-class Setup(NamedTuple):
-    """What a page is opened with."""
-
-    robot: Robot
-    model: mujoco.MjModel
-    sets: dict[str, Weights]  # one or two, by their names
-    named: dict[str, Weights]  # sets that a button takes
-    world: str  # of WORLDS
-    seed: int  # of the plant
-    line: Callable[[Sequence[str], str, int], str]  # that repeats files, world and seed
 
 
 def serve_live(server: Any, setup: Setup, connection: Connection, tuner: Tuner) -> None:
@@ -87,10 +55,8 @@ class LivePage:
         self._server, self._setup, self._tuner = server, setup, tuner
         self._send = lambda name, *values: connection.send((name, values))
         self._calls: SimpleQueue[Callable[[], None]] = SimpleQueue()
-        self._names, self._weights = list(setup.sets), list(setup.sets.values())
+        self._names = list(setup.sets)
         self._plant = named_world(setup.world, setup.seed, setup.robot.description)
-        self._undo: list[tuple[int, Weights]] = []
-        self._saved: dict[int, str] = {}
         self._strips = [deque[tuple[float, ...]]() for _ in self._names]
         self._data, self._next, self._moved = mujoco.MjData(setup.model), 0.0, False
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
@@ -98,7 +64,7 @@ class LivePage:
         self._status = server.gui.add_markdown("")
         self._add_walk()
         self._add_errors()
-        self._add_weights()
+        self._weights = WeightsPanel(server.gui, self._when, setup, self._send, self._line)
         self._add_tuning()
         self._add_plant()
         self._build_world()
@@ -110,7 +76,7 @@ class LivePage:
         if (found := self._tuner.found()) is not None:
             self._found.content = found.text
             if found.weights is not None:
-                self._set_weights(found.set, found.weights)
+                self._weights.set(found.set, found.weights)
 
     def _when(self, handle: Any, do: Callable[..., None]) -> Any:
         """Let `do` be called, by the loop, with what a client chose of a handle."""
@@ -123,6 +89,12 @@ class LivePage:
 
         event(by_client)
         return handle
+
+    def _line(self, files: Sequence[str]) -> str:
+        """Return how a client repeats this page with files, in Markdown."""
+        line = self._setup.line(files, self._setup.world, self._setup.seed)
+        more = " Velocities and numbers of the plant are not in it." * self._moved
+        return f"Saved. This repeats it:{more}\n\n```\n{line}\n```"
 
     # The panel
 
@@ -166,40 +138,6 @@ class LivePage:
             empty = {name: np.full(1, np.nan) for name in self._names}
             titles = "off its reference, in the plane [cm]", "roll and pitch together [degrees]"
             self._plots = [plot(gui, title, "time [s]", np.zeros(1), empty) for title in titles]
-
-    def _add_weights(self) -> None:
-        gui, names = self._server.gui, direction_names(self._weights[0])
-        edges = (
-            dict(zip(names, _of_directions(x), strict=True)) for x in bounds(like=self._weights[0])
-        )
-        low, high = edges
-        self._sliders, self._units = {}, {}
-        with gui.add_folder("Weights"):
-            self._set = gui.add_dropdown("of the set", self._names, initial_value=self._names[0])
-            self._set.visible = len(self._names) > 1
-            self._when(self._set, lambda _: self._show_weights())
-            take = gui.add_button_group("as", list(self._setup.named))
-            self._when(take, lambda name: self._change(self._setup.named[name]))
-            self._when(gui.add_button("Undo"), self._undo_last)
-            for title, (members, unit) in _GROUPS.items():
-                present = [name for name in members if name in names]
-                if not present:
-                    continue
-                with gui.add_folder(title, expand_by_default=title == "Orientation"):
-                    for name in present:
-                        self._units[name] = f"1/({unit})²"
-                        ends = np.log10(low[name]), np.log10(high[name])
-                        marks = [
-                            (e, f"{10.0**e:g}")
-                            for e in range(round(ends[0]), round(ends[1]) + 1, 2)
-                        ]
-                        slider = gui.add_slider(name, *ends, 0.02, ends[0], marks=tuple(marks))
-                        turn = lambda value, name=name: self._turn(name, value)  # noqa: E731
-                        self._sliders[name] = self._when(slider, turn)
-            self._file = gui.add_text("file", "live.json")
-            self._when(gui.add_button("Save these weights"), self._save)
-            self._line = gui.add_markdown("")
-        self._show_weights()
 
     def _add_tuning(self) -> None:
         gui = self._server.gui
@@ -247,69 +185,12 @@ class LivePage:
             for handle in (mass, friction, delay, payload):
                 self._when(handle, change)
 
-    # Weights
-
-    @property
-    def _chosen(self) -> int:
-        return self._names.index(self._set.value)
-
-    def _show_weights(self) -> None:
-        weights = self._weights[self._chosen]
-        for name, value in zip(direction_names(weights), _of_directions(weights), strict=True):
-            slider = self._sliders[name]
-            slider.value = float(np.clip(np.log10(value), slider.min, slider.max))
-            slider.label = f"{name} = {value:.3g} {self._units[name]}"
-
-    def _set_weights(self, i: int, weights: Weights) -> None:
-        self._undo.append((i, self._weights[i]))
-        self._weights[i] = weights
-        self._send("set_weights", i, weights)
-        self._show_weights()
-
-    def _change(self, weights: Weights) -> None:
-        self._set_weights(self._chosen, weights)
-
-    def _turn(self, name: str, log: float) -> None:
-        """Give a weight the value of its slider, for all feet."""
-        weights = self._weights[self._chosen]
-        names, at = direction_names(weights), _of_directions(weights)
-        steps = np.zeros(len(names))
-        steps[names.index(name)] = np.log(10.0**log / at[names.index(name)])
-        scaled = scale_weights(weights, steps)
-        self._change(scaled._replace(Q=_numpy(scaled.Q), R=_numpy(scaled.R)))
-
-    def _undo_last(self, _: Any) -> None:
-        if self._undo:
-            i, weights = self._undo.pop()
-            self._set_weights(i, weights)
-            self._undo.pop()  # of the undoing
-
-    def _save(self, _: Any) -> None:
-        """Write the weights to a file of this folder: a client of the page has no other."""
-        name, i = self._file.value, self._chosen
-        path = Path(name)
-        if not re.fullmatch(r"\w[\w.-]*\.json", name):
-            self._line.content = "The name of the file must end in `.json`, without a folder."
-        elif path.exists() and name not in self._saved.values():
-            self._line.content = f"`{name}` exists: choose another name."
-        else:
-            try:
-                save_weights(path, self._weights[i])
-            except InputError as error:
-                self._line.content = str(error)
-                return
-            self._saved[i] = name
-            sets = [self._saved.get(k, set) for k, set in enumerate(self._names)]
-            line = self._setup.line(sets, self._setup.world, self._setup.seed)
-            more = " Velocities and numbers of the plant are not in it." * self._moved
-            self._line.content = f"Saved. This repeats it:{more}\n\n```\n{line}\n```"
-
     # Tuning
 
     def _ask(self, what: str) -> None:
-        self._wanted = what, self._chosen
+        self._wanted = what, self._weights.chosen
         self._found.content = "computing ..."
-        self._send("log", self._chosen)
+        self._send("log", self._wanted[1])
 
     def tune(self, walked: Walked | str) -> None:
         """Compute what a client asked for from a walk, or show why that cannot be."""
@@ -410,15 +291,6 @@ class LivePage:
         solved = now.residual <= SOLVED
         qp = "QP solved" if solved else f"**QP not solved**, residual {now.residual:.0e}"
         return f"{now.time:.1f} s; {qp}; " + ("; ".join(text) or "in the air")
-
-
-def _numpy(tree: Any) -> Any:
-    return type(tree)(*map(np.asarray, tree))
-
-
-def _of_directions(weights: Weights) -> Float[np.ndarray, " n"]:
-    """Return the weights of `direction_names`: of the first foot."""
-    return np.asarray(weights_to_vector(weights))[directions(weights).argmax(axis=1)]
 
 
 def _row(name: str, errors: Float[np.ndarray, "6"]) -> str:
