@@ -41,6 +41,29 @@ class Tab:
         found = self.call("Runtime.evaluate", expression="document.body.innerText")
         return found["result"]["value"]
 
+    def run(self, script):
+        """What a line of the browser's language gives."""
+        return self.call("Runtime.evaluate", expression=script)["result"].get("value")
+
+    def click(self, words):
+        """Click the button with these words."""
+        button = f"[...document.querySelectorAll('button,label')].find(b => b.innerText=='{words}')"
+        assert self.run(f"(b => b ? (b.click(), true) : false)({button})"), f"no button {words}"
+
+    def fill(self, label, text):
+        """Type into the last field of the row whose label begins with a word."""
+        rows = "[...document.querySelectorAll('label')]"
+        rows += f".filter(l => l.innerText.startsWith('{label}'))"
+        up = "while (l && !l.querySelector('input')) l = l.parentElement"
+        last = (
+            "const f = [...l.querySelectorAll('input')].pop(); f.focus(); f.select(); return true"
+        )
+        assert self.run(f"(l => {{ {up}; {last} }})({rows}[0])"), f"no field {label}"
+        self.call("Input.insertText", text=text)
+        for kind in ("keyDown", "keyUp"):
+            enter = {"key": "Enter", "code": "Enter", "windowsVirtualKeyCode": 13}
+            self.call("Input.dispatchKeyEvent", type=kind, **enter)
+
     def picture(self):
         """What is seen, (height, width, 3)."""
         png = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])

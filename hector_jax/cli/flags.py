@@ -369,12 +369,17 @@ class Export(Printed):
 
 @_command
 class View(Flags):
-    """Show a run in the browser: walks before and after, ground forces, tuning in progress.
+    """Show a run in the browser, before and after; or a live walk, of which all can be turned.
 
     Example: hector view latest --world standin
     """
 
-    run: Run  # folder of a run of `hector tune`, finished or in progress, or `latest`
+    # folder of a run of `hector tune`, finished or in progress, or `latest`
+    run: tuple[Run, ...] = field(metadata={"or": "live"})
+    live: bool = False  # instead: walk in real time, turn weights, push, tune step by step
+    robot: RobotFile = None  # TOML file of the robot of a live walk; HECTOR by default
+    # weights of a live walk, one or two: nominal, expert, best or a weights file
+    weights: tuple[Weights, ...] = ("nominal",)
     # weight sets of the run: before and after; while it is tuned, `with` in place of `best`
     sets: tuple[str, str] = ("nominal", "best")
     world: World = "hfs"  # where both walk

@@ -1,9 +1,11 @@
-"""`hector view`: show a run on a web page, or as a film and pictures."""
+"""`hector view`: show a run or a live walk on a web page, or a run as a film and pictures."""
 
 import math
+from pathlib import Path
 
 from hector_jax.cli import arguments
 from hector_jax.cli.flags import View
+from hector_jax.cli.live import run_live
 from hector_jax.control.controller import walk_config
 from hector_jax.core.console import say
 from hector_jax.core.files import make_folder
@@ -22,22 +24,34 @@ from hector_jax.store.run import Run
 from hector_jax.verdict import metrics
 
 
+def _run_of(args: View) -> Path:
+    for name in ("robot", "weights"):
+        if args.is_given(name):
+            raise InputError(f"--{name} is of a live walk: --live")
+    if len(args.run) != 1:
+        raise InputError(f"view shows one run, got {len(args.run)}")
+    return args.run[0]
+
+
 def run_view(args: View) -> None:
-    """Show a run on a page, or write its film and pictures."""
-    folder = args.out
+    """Show a run or a live walk on a page, or write a run's film and pictures."""
+    if args.live:
+        run_live(args)
+        return
+    path, folder = _run_of(args), args.out
     if folder is None:
         require_package("viser", "view", "the page", " (--out writes a film without it)")
     else:
         check_film(folder / "film.mp4")
-    run = Run(args.run)
+    run = Run(path)
     request, robot = run.request, run.robot
     command = arguments.load_trajectory(request.trajectory, robot)
     if folder is not None:
-        if folder.resolve() == args.run.resolve():
+        if folder.resolve() == path.resolve():
             raise InputError(f"--out must not be the folder of the run, got {folder}")
         make_folder(folder)
     before, after = args.sets
-    if not args.is_given("sets") and not (args.run / "weights" / f"{after}.json").exists():
+    if not args.is_given("sets") and not (path / "weights" / f"{after}.json").exists():
         after = "with"  # `best` is chosen at the end of a run
     sets = {name: run.weights(name, robot) for name in (before, after)}
     data = arguments.data_folder(request.data, request.robot, robot)
@@ -78,4 +92,4 @@ def run_view(args: View) -> None:
         return
     on_open = lambda address: say(f"open {address} in a browser; Ctrl-C ends it")  # noqa: E731
     address = {"host": args.host, "port": args.port}
-    view.serve(motions, compile_model(robot.description), args.run, on_open, **address)
+    view.serve(motions, compile_model(robot.description), path, on_open, **address)

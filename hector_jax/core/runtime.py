@@ -179,6 +179,19 @@ def start_worker(parent: Surroundings | None = None) -> None:
     setup_jax()
 
 
+def _work(parent: Surroundings, work: Callable[..., None], inputs: tuple) -> None:
+    start_worker(parent)
+    with suppress(EOFError, BrokenPipeError):  # the other end of a pipe is gone
+        work(*inputs)
+
+
+def start_process(work: Callable[..., None], *inputs: Any) -> SpawnProcess:
+    """Start a process that does one work, set up by `start_worker`, and ends with this one."""
+    process = _Process(target=_work, args=(started_with(), work, inputs), daemon=True)
+    process.start()
+    return process
+
+
 class _Here(Executor):
     """Calls in this process."""
 

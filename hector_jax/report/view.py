@@ -12,11 +12,10 @@ import os
 import re
 import socket
 import time
-from collections.abc import Callable, Mapping
-from contextlib import redirect_stdout
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, redirect_stdout
 from functools import partial
 from http import HTTPStatus
-from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +28,7 @@ from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.report.motion import INK, Motion
 from hector_jax.report.plots.style import rgb_of
 from hector_jax.report.report import render
+from hector_jax.report.view_parts import add_floor, body_meshes, plot, series
 from hector_jax.store.run import METRICS, Run, loss_curves, progress_sentence
 
 _RATE = 30.0  # displayed ticks per second, at most
@@ -40,7 +40,6 @@ _MIN_ARROW = 0.07  # shorter ones are not drawn
 _HEAD = 0.083  # of an arrow
 _RADII = {"force": 0.019, "moment": 0.033}  # of the shafts of arrows
 _LEVER = 0.24  # of the moment that is drawn as long as the weight: the weight at this lever
-_DASHES = ([6, 4], [], [2, 3], [10, 3, 2, 3])  # of lines in plots: before, after, further sets
 _NO_CURVES = {"no iteration yet": np.full(1, np.nan)}  # viser refuses a plot without a line
 
 
@@ -106,23 +105,30 @@ def serve(
     Raises:
         InputError: the server cannot listen on the address.
     """
+    with opened_server(host, port) as (server, address):
+        note = server.gui.add_markdown("The robots walk in a moment.")
+        on_open(address)
+        motions, description = walk()
+        note.remove()
+        page = Page(server, motions, model, folder, description)
+        last = time.monotonic()
+        while True:
+            time.sleep(1.0 / _RATE)
+            now = time.monotonic()
+            page.advance(now - last)
+            last = now
+
+
+@contextmanager
+def opened_server(host: str, port: int) -> Iterator[tuple[Any, str]]:
+    """Open a `viser.ViserServer`, see `serve`; yields it with the page's address."""
     # a browser that disconnects early would print a traceback
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     # viser prints the address itself
     with Path(os.devnull).open("w") as null, redirect_stdout(null):
         server = _server(host, _free_port(host, port))
         try:
-            note = server.gui.add_markdown("The robots walk in a moment.")
-            on_open(f"http://{_in_url(host)}:{server.get_port()}")
-            motions, description = walk()
-            note.remove()
-            page = Page(server, motions, model, folder, description)
-            last = time.monotonic()
-            while True:
-                time.sleep(1.0 / _RATE)
-                now = time.monotonic()
-                page.advance(now - last)
-                last = now
+            yield server, f"http://{_in_url(host)}:{server.get_port()}"
         finally:
             server.stop()
 
@@ -227,14 +233,14 @@ class Page:
             labels |= {"force": "forces", "moment": "moments"}
             self._boxes = {n: gui.add_checkbox(text, n != "moment") for n, text in labels.items()}
         with gui.add_folder("Tuning"):
-            self._losses = _plot(
+            self._losses = plot(
                 gui, "loss on the model [% of the start]", "iteration", np.zeros(1), _NO_CURVES
             )
             self._progress = gui.add_markdown("")
         with gui.add_folder("Distance from the reference"):
             lines = [100.0 * motion.distance[: self._length] for motion in self._motions]
             errors = dict(zip(self._names, lines, strict=True))
-            _plot(gui, "in the plane [cm]", "time [s]", times, errors)
+            plot(gui, "in the plane [cm]", "time [s]", times, errors)
         self._button.on_click(lambda _: self._play(not self._playing))
         # pause when the user moves the slider, which `advance` also moves
         self._time.on_update(lambda event: event.client is not None and self._play(False))
@@ -255,10 +261,7 @@ class Page:
         height = self._motions[0].height
         camera.look_at = (0.0, 0.0, 0.76 * height)
         camera.position = tuple(height * np.array([3.8 * np.cos(side), 3.8 * np.sin(side), 1.8]))
-        self._world = scene.add_frame("/world", show_axes=False)
-        colours = {"cell_color": (224, 228, 233), "section_color": (196, 203, 211)}
-        colours |= {"plane_color": (241, 243, 246), "plane_opacity": 1.0}
-        scene.add_grid("/world/floor", 30.0, 30.0, **colours)
+        self._world = add_floor(scene)
         self._handles = []
         for i in range(len(self._motions)):
             position = (0.5 - i) * _DISTANCE * height * across
@@ -332,59 +335,11 @@ class Page:
         lines = loss_curves(histories) or _NO_CURVES
         iterations = np.arange(float(len(next(iter(lines.values())))))
         with self._server.atomic():
-            self._losses.series = _series("iteration", lines)
+            self._losses.series = series("iteration", lines)
             self._losses.data = (iterations, *lines.values())
             self._progress.content = progress_sentence(histories, done)
-
-
-def _plot(gui: Any, title: str, x_name: str, x: np.ndarray, lines: Mapping[str, np.ndarray]) -> Any:
-    """Add a plot to the panel."""
-    axes = {"scales": {"x": {"time": False}}, "axes": ({"label": x_name}, {}), "aspect": 2.0}
-    return gui.add_uplot((x, *lines.values()), _series(x_name, lines), title=title, **axes)
-
-
-def _series(x_name: str, names: Mapping[str, Any]) -> tuple[dict[str, Any], ...]:
-    looks = zip(names, rgb_of(names), cycle(_DASHES), strict=False)
-    lines = ({"label": n, "stroke": f"rgb{c}", "dash": d, "width": 2} for n, c, d in looks)
-    return ({"label": x_name}, *lines)
 
 
 def _segments(points: Float[np.ndarray, "T 3"], ticks: int) -> Float[np.ndarray, "n 2 3"]:
     """Split a path into segments of `ticks` ticks each."""
     return np.stack([points[:-ticks:ticks], points[ticks::ticks]], axis=1)
-
-
-def body_meshes(model: mujoco.MjModel, accent: tuple[int, int, int]) -> dict[int, Any]:
-    """Make a mesh of the visible geoms of each body (geom groups 0 to 2).
-
-    Args:
-        model: model of the robot.
-        accent: colour for the material named "accent".
-    """
-    import trimesh
-    from trimesh.creation import box, capsule, cylinder, icosphere
-
-    kinds = mujoco.mjtGeom
-    solids = {  # from MuJoCo's sizes
-        kinds.mjGEOM_BOX: lambda size: box(extents=2.0 * size),
-        kinds.mjGEOM_CYLINDER: lambda size: cylinder(radius=size[0], height=2.0 * size[1]),
-        kinds.mjGEOM_CAPSULE: lambda size: capsule(radius=size[0], height=2.0 * size[1]),
-        kinds.mjGEOM_SPHERE: lambda size: icosphere(subdivisions=2, radius=size[0]),
-        kinds.mjGEOM_ELLIPSOID: lambda size: icosphere(subdivisions=2).apply_scale(size),
-    }
-    meshes: dict[int, list[Any]] = {}
-    for geom in map(model.geom, range(model.ngeom)):
-        body, kind, material = geom.bodyid[0], kinds(geom.type[0]), geom.matid[0]
-        if body == 0 or geom.group[0] > 2 or kind not in solids:
-            continue
-        mesh = solids[kind](geom.size)
-        if kind in (kinds.mjGEOM_BOX, kinds.mjGEOM_CYLINDER):
-            mesh.unmerge_vertices()  # draws sharp edges
-        rgba = model.mat_rgba[material] if material >= 0 else geom.rgba
-        if material >= 0 and model.material(material).name == "accent":
-            rgba = np.array([*accent, 255]) / 255.0
-        mesh.apply_transform(trimesh.transformations.quaternion_matrix(geom.quat))
-        mesh.apply_translation(geom.pos)
-        mesh.visual.vertex_colors = np.round(255.0 * np.asarray(rgba)).astype(np.uint8)
-        meshes.setdefault(int(body), []).append(mesh)
-    return {body: trimesh.util.concatenate(parts) for body, parts in meshes.items()}

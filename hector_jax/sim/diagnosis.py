@@ -4,6 +4,7 @@ A trajectory has the samples from t = 0 on, without torques and contacts. A walk
 simulated once more with each millisecond recorded, so that a normal walk costs nothing extra.
 """
 
+from collections import deque
 from collections.abc import Iterable, Iterator
 from functools import partial
 from typing import NamedTuple
@@ -82,47 +83,69 @@ class Fault(NamedTuple):
     remedy: str
 
 
+class Recorder:
+    """Notes each millisecond of a walk; `note` is called after each step of its `MujocoPlant`."""
+
+    def __init__(self, robot: Robot, body: Robot, most: int | None = None) -> None:
+        """Begin a record of the last `most` milliseconds, by default of all.
+
+        Args:
+            robot: the controller's.
+            body: the plant's, see `Job.body`.
+            most: number of milliseconds.
+        """
+        self._robot, self._feet = robot, body.description.named_feet
+        self._limits = robot.description.limits
+        self._rows: deque[tuple] = deque(maxlen=most)
+        self._touching: list[str] = []
+
+    def note(self, world: World, data: mujoco.MjData) -> None:
+        """Note a millisecond; none after a fall."""
+        rows = self._rows
+        if rows and rows[-1][-1]:
+            return  # the rest of the ten ticks in which it fell
+        up = rotation_of(data.qpos[3:7])[2]  # z of the trunk's axes in the world
+        roll, pitch = np.arctan2(up[1], up[2]), -np.arcsin(np.clip(up[0], -1.0, 1.0))
+        height = data.qpos[2] + up @ self._robot.com_offset
+        torque = data.ctrl / world.model.actuator_ctrlrange[:, 1]
+        *contacts, self._touching = _contacts(world, data, len(self._feet))
+        soles = [
+            _tilt_of(np.array([data.geom(name).xpos for name in f.contacts])) for f in self._feet
+        ]
+        # false for values that are not finite
+        min_height, max_tilt = self._limits
+        upright = height >= min_height and max(abs(roll), abs(pitch)) <= max_tilt
+        fallen = bool(self._touching) or not upright
+        rows.append((height, (roll, pitch), torque, *contacts, soles, fallen))
+
+    def record(self, trajectory: Trajectory, lead: int = 0) -> Record:
+        """Return what was noted of a walk whose record begins `lead` milliseconds before t = 0."""
+        columns = map(np.array, zip(*self._rows, strict=True))
+        height, angles, torque, force, use, legs_touch, sole, fallen = columns
+        return Record(
+            time=TIME_STEP * (1 + np.arange(len(height)) - lead),
+            height=height,
+            angles=angles,
+            torque=torque,
+            load=force / float(self._robot.mass * self._robot.gravity[2]),
+            friction=use,
+            sole=sole,
+            legs_touch=legs_touch,
+            touching=", ".join(self._touching),
+            fallen=bool(fallen[-1]),
+            trajectory=trajectory,
+        )
+
+
 def record_walk(config: WalkConfig, robot: Robot, job: Job) -> Record:
     """Walk once with each millisecond recorded.
 
     Args:
         config, robot, job: as for `walk`.
     """
-    rows, touching = [], []
-    min_height, max_tilt = robot.description.limits
-    feet = job.body(robot).description.named_feet
-
-    def append(world: World, data: mujoco.MjData) -> None:
-        if rows and rows[-1][-1]:
-            return  # the rest of the ten ticks in which it fell
-        up = rotation_of(data.qpos[3:7])[2]  # z of the trunk's axes in the world
-        roll, pitch = np.arctan2(up[1], up[2]), -np.arcsin(np.clip(up[0], -1.0, 1.0))
-        height = data.qpos[2] + up @ robot.com_offset
-        torque = data.ctrl / world.model.actuator_ctrlrange[:, 1]
-        *contacts, touching[:] = _contacts(world, data, len(feet))
-        soles = [_tilt_of(np.array([data.geom(name).xpos for name in f.contacts])) for f in feet]
-        # false for values that are not finite
-        upright = height >= min_height and max(abs(roll), abs(pitch)) <= max_tilt
-        fallen = bool(touching) or not upright
-        rows.append((height, (roll, pitch), torque, *contacts, soles, fallen))
-
-    trajectory = walk(config, robot, job, build=partial(MujocoPlant, on_step=append))
-    columns = map(np.array, zip(*rows, strict=True))
-    height, angles, torque, force, use, legs_touch, sole, fallen = columns
-    lead = (job.start_tick - first_tick(config)) * substeps(config)
-    return Record(
-        time=TIME_STEP * (1 + np.arange(len(rows)) - lead),
-        height=height,
-        angles=angles,
-        torque=torque,
-        load=force / float(robot.mass * robot.gravity[2]),
-        friction=use,
-        sole=sole,
-        legs_touch=legs_touch,
-        touching=", ".join(touching),
-        fallen=bool(fallen[-1]),
-        trajectory=trajectory,
-    )
+    recorder = Recorder(robot, job.body(robot))
+    trajectory = walk(config, robot, job, build=partial(MujocoPlant, on_step=recorder.note))
+    return recorder.record(trajectory, (job.start_tick - first_tick(config)) * substeps(config))
 
 
 def _contacts(

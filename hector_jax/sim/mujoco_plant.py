@@ -1,6 +1,6 @@
 """A plant in MuJoCo C."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from jaxtyping import Float
@@ -68,3 +68,29 @@ class MujocoPlant(Plant):
         """See `Plant`."""
         steps, self._steps = self._steps, 0
         return sensing.sensed_ground(self._sensed[:steps], self._feet)
+
+    def mean_force(self, steps: int) -> Float[np.ndarray, "feet 3"]:
+        """Return the mean force on each foot [N] over the last steps, at most those it notes."""
+        rows = self._sensed[np.arange(self._steps - steps, self._steps)]
+        return sensing.sensed_ground(rows, self._feet).force.mean(axis=0)
+
+    def state(self) -> Float[np.ndarray, " n"]:
+        """Return all that the next steps follow from, for `replay`."""
+        kind, model = mujoco.mjtState.mjSTATE_INTEGRATION, self.world.model
+        state = np.zeros(mujoco.mj_stateSize(model, kind))
+        mujoco.mj_getState(model, self.data, state, kind)
+        return state
+
+    def replay(
+        self,
+        state: Float[np.ndarray, " n"],
+        forces: Iterable[tuple[np.ndarray, np.ndarray]],
+        on_step: Callable[[World, mujoco.MjData], None],
+    ) -> None:
+        """Step again from a state under torques and forces on the trunk, beside this walk."""
+        model, data = self.world.model, mujoco.MjData(self.world.model)
+        mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+        for torque, force in forces:
+            data.ctrl[:], data.xfrc_applied[self.world.trunk, :3] = torque, force
+            mujoco.mj_step(model, data)
+            on_step(self.world, data)

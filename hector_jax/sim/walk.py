@@ -7,7 +7,7 @@ outputs are packed into a few flat arrays, because the cost of a call grows with
 fall ends the walk: later samples repeat the last valid one and are marked as fallen.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from functools import cache, partial
@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
+from jaxtyping import Float
 
 from hector_jax.control import controller
 from hector_jax.control.controller import Memory, Plan, WalkConfig
@@ -151,7 +152,7 @@ def _torques(config: WalkConfig, *layouts: Layout) -> Callable[..., Array]:
     return jax.jit(torques)
 
 
-_BLOCK = 10  # ticks that are sampled by one call, whose cost hardly grows with their number
+BLOCK = 10  # ticks that are sampled by one call, whose cost hardly grows with their number
 _pack = jax.jit(pack)
 _push_forces = jax.jit(jax.vmap(push_force, in_axes=(None, 0)))
 
@@ -202,55 +203,127 @@ def _simulate(
     config: WalkConfig, robot: Robot, job: Job, plant: Plant, *, ticks: int
 ) -> tuple[Plan, Sample]:
     """Return the plans of all ticks and the samples (numpy), until t = `ticks` or a fall."""
-    count, first = substeps(config), first_tick(config)
-    start, steps = job.start_tick, (job.start_tick - first + ticks) * count
-    joints, lead = len(robot.joint_lower), steps - ticks * count
-    forces = np.asarray(_push_forces(job.push, np.arange(-lead, ticks * count)))
-    errors = sensing.draw_errors(job.imperfections.estimator, joints, job.seed, lead, ticks * count)
-    # inputs of each millisecond: milliseconds since the plan, reading, error
-    rows = np.zeros((steps + 1, 1 + 13 + 3 * joints + errors.shape[1]))
-    rows[:, 0], rows[:-1, -errors.shape[1] :] = np.arange(steps + 1) % count, errors
-    readings, clock, yaw = rows[:, 1 : -errors.shape[1]], np.int32(0), np.zeros(())
-    next_readings = readings[1:]
-    plant.read(readings[0])
-    body, command = jax.device_put((robot, with_pieces(job.command)))
-    constants = body, _parameters(config, job.weights), command, job.imperfections
-    anchor, memory = standing_anchor(robot, start), _begin(body, readings[0])
-    state, measured = (np.zeros(joints), yaw, init_actuators(joints)), (readings[0], errors[0])
-    of_constants, of_inputs = layout(constants), layout((anchor, clock, memory, yaw, *measured))
-    trees = anchor, constants, state, memory
-    packed_anchor, packed_constants, packed_state, packed = map(_pack, trees)
-    planner_for = cache(partial(_planner, config, of_constants, of_inputs))
-    sampled = _sampler(config, of_constants, of_inputs)
-    memory_size, inputs, plans, samples = packed.size, [], [], []
-    torques, planner, step = None, None, 0
+    count, lead = substeps(config), job.start_tick - first_tick(config)
+    joints, steps = len(robot.joint_lower), (lead + ticks) * count
+    forces = np.asarray(_push_forces(job.push, np.arange(-lead * count, ticks * count)))
+    noise = job.imperfections.estimator
+    errors = sensing.draw_errors(noise, joints, job.seed, lead * count, ticks * count)
+    stepper, step = Stepper(config, robot, job, plant), 0
+    plans, samples = [], []
     while step < steps and not (plant.broken or samples and samples[-1].fallen.any()):
-        begin = step
-        for _ in range(_BLOCK if steps - step >= _BLOCK * count else 1):
-            tick, reading = first + step // count, readings[step]
-            if tick == start:
-                packed_anchor = _pack(_anchor(body, reading, yaw, start))
-            planner = planner_for(controller.contacts_needed(config, tick))
-            parts = packed_anchor, [tick], np.asarray(packed)[:memory_size], [yaw], rows[step, 1:]
-            inputs.append(np.concatenate(parts))
-            packed = planner.plan(packed_constants, inputs[-1])
-            plans.append(np.asarray(packed))
-            if torques is None:
-                of_inputs = layout((clock, *measured))
-                torques = _torques(config, of_constants, planner.layout, layout(state), of_inputs)
+        for _ in range(BLOCK if steps - step >= BLOCK * count else 1):
             now, step = slice(step, step + count), step + count
-            for row, force, after in zip(rows[now], forces[now], next_readings[now], strict=True):
-                packed_state = torques(packed_constants, packed, packed_state, row)
-                plant.step(np.asarray(packed_state)[:joints], force)
-                plant.read(after)
-            yaw = np.asarray(packed_state)[joints]
+            stepper.tick(errors[now], forces[now])
             if plant.broken:
                 break  # rare: the samples of less than a block are another program
-        block, read = np.stack(inputs[begin // count :]), readings[begin : step + 1]
-        samples.append(jax.device_get(sampled(packed_constants, block, read, plant.ground())))
-    assert planner is not None  # it has planned
-    plan = unpack(planner.layout, np.stack(plans))[1]
-    return plan, jax.tree.map(lambda *x: np.concatenate(x), *samples)
+        planned, sampled = stepper.samples()
+        plans.append(planned)
+        samples.append(sampled)
+    return joined(plans), joined(samples)
+
+
+def joined(blocks: Iterable[Any]) -> Any:
+    """Concatenate the trees of blocks of a walk."""
+    return jax.tree.map(lambda *x: np.concatenate(x), *blocks)
+
+
+class Stepper:
+    """The closed loop of one walk, tick by tick; what it has in `job` may change between ticks.
+
+    Weights change between any two ticks, a command only after `samples`, which are of one command.
+    """
+
+    def __init__(self, config: WalkConfig, robot: Robot, job: Job, plant: Plant) -> None:
+        """Begin a walk; its plant notes at least BLOCK ticks between calls of `samples`."""
+        self.config, self.robot, self.plant = config, robot, plant
+        self.count, self.clock = substeps(config), first_tick(config)  # the next gait tick
+        joints, self._start, yaw = len(robot.joint_lower), job.start_tick, np.zeros(())
+        size = len(sensing.no_error(robot))
+        # inputs of each millisecond of a block: milliseconds since the plan, reading, error
+        self._rows = np.zeros((BLOCK * self.count + 1, 1 + 13 + 3 * joints + size))
+        self._rows[:, 0] = np.arange(len(self._rows)) % self.count
+        self._errors, self._readings = self._rows[:, -size:], self._rows[:, 1:-size]
+        plant.read(self._readings[0])
+        self._body, self.anchor = jax.device_put(robot), standing_anchor(robot, job.start_tick)
+        memory = _begin(self._body, self._readings[0])
+        state = np.zeros(joints), yaw, init_actuators(joints)
+        measured = self._readings[0], self._errors[0]
+        clock = np.int32(0)
+        self.set_job(job)
+        of_inputs = layout((self.anchor, clock, memory, yaw, *measured))
+        self._packed_anchor, self._state, packed = map(_pack, (self.anchor, state, memory))
+        self._packed, self._memory_size, self._yaw, self._joints = packed, packed.size, yaw, joints
+        self._planner_for = cache(partial(_planner, config, self._of_constants, of_inputs))
+        self._sampled = _sampler(config, self._of_constants, of_inputs)
+        self._torques_of = partial(_torques, config, self._of_constants)
+        self._torques, self._layouts = None, (layout(state), layout((clock, *measured)))
+        self._inputs: list[np.ndarray] = []
+        self._plans: list[np.ndarray] = []
+
+    def set_job(self, job: Job) -> None:
+        """Take the weights, command and imperfections of a job, as they are for the motors."""
+        command = jax.device_put(with_pieces(job.command))
+        numbers = _parameters(self.config, job.weights)
+        constants = self._body, numbers, command, job.imperfections
+        self._of_constants, self._constants = layout(constants), _pack(constants)
+
+    def set_anchor(self, anchor: Anchor) -> None:
+        """Let the reference start elsewhere."""
+        self.anchor, self._packed_anchor = anchor, _pack(anchor)
+
+    @property
+    def reading(self) -> Float[np.ndarray, " reading"]:
+        """The coordinates now, see `sensing.Reading`."""
+        return self._readings[len(self._plans) * self.count]
+
+    @property
+    def last_plan(self) -> Plan:
+        """The plan of the last tick (numpy)."""
+        return unpack(self._plan_layout, np.asarray(self._packed))[1]
+
+    def tick(self, errors: Float[np.ndarray, "n errors"], forces: Float[np.ndarray, "n 3"]) -> None:
+        """Plan, and step the plant to the next plan.
+
+        Args:
+            errors: of the estimate in each of the n milliseconds.
+            forces: on the trunk in each of them [N].
+        """
+        step, plant, rows = len(self._plans) * self.count, self.plant, self._rows
+        now = slice(step, step + self.count)
+        self._errors[now] = errors
+        if self.clock == self._start:
+            self.set_anchor(_anchor(self._body, self._readings[step], self._yaw, self._start))
+        planner = self._planner_for(controller.contacts_needed(self.config, self.clock))
+        memory = np.asarray(self._packed)[: self._memory_size]
+        parts = self._packed_anchor, [self.clock], memory, [self._yaw], rows[step, 1:]
+        self._inputs.append(np.concatenate(parts))
+        self._packed = packed = planner.plan(self._constants, self._inputs[-1])
+        self._plans.append(np.asarray(packed))
+        if self._torques is None:
+            self._plan_layout = planner.layout
+            self._torques = self._torques_of(planner.layout, *self._layouts)
+        constants, torques, state, joints = (
+            self._constants,
+            self._torques,
+            self._state,
+            self._joints,
+        )
+        after = self._readings[step + 1 : step + self.count + 1]
+        for row, force, reading in zip(rows[now], forces, after, strict=True):
+            state = torques(constants, packed, state, row)
+            plant.step(np.asarray(state)[:joints], force)
+            plant.read(reading)
+        self._state, self._yaw, self.clock = state, np.asarray(state)[joints], self.clock + 1
+
+    def samples(self) -> tuple[Plan, Sample]:
+        """Return the plans and samples (numpy) since the last call, of at least one tick."""
+        end = len(self._plans) * self.count
+        block, readings = np.stack(self._inputs), self._readings[: end + 1]
+        found = self._sampled(self._constants, block, readings, self.plant.ground())
+        found = jax.device_get(found)  # before the readings are written over
+        plans = unpack(self._plan_layout, np.stack(self._plans))[1]
+        self._readings[0], self._inputs, self._plans = self._readings[end], [], []
+        return plans, found
 
 
 def on_host(job: Job) -> Job:

@@ -92,6 +92,7 @@ def fit_grounding(
     start_tick: Int[Array, ""] | int = 0,
     *,
     called: CalledPlans | None = None,
+    anchor: Anchor | None = None,
 ) -> Grounding:
     """Compute the residuals of the model along a walk.
 
@@ -103,6 +104,7 @@ def fit_grounding(
             interval: T samples.
         start_tick: gait tick of t = 0.
         called: plans of another controller for all ticks but the first; None: this project's.
+        anchor: where the command began, before t = 0; None: at t = 0, where the robot was.
 
     Raises:
         ValueError: the walk has another number of ticks, from `jax.lax.scan`.
@@ -111,7 +113,8 @@ def fit_grounding(
     """
     robot, belief = scenario.robot, walk.belief
     assert belief is not None  # zero in a log without it
-    anchor, tick = anchor_at(robot, walk.initial, start_tick), jnp.asarray(start_tick) + 1
+    anchor = anchor_at(robot, walk.initial, start_tick) if anchor is None else anchor
+    tick = jnp.asarray(start_tick) + 1
     begins, estimated = begins_of_ticks(robot, walk)
     errors = jax.tree.map(jnp.subtract, estimated, begins)
     first, command_before = jax.tree.map(lambda x: x[0], (begins, walk.command))

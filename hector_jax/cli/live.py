@@ -1,0 +1,81 @@
+"""`hector view --live`: a robot that walks on a page while its weights are turned."""
+
+import shlex
+from collections.abc import Sequence
+from contextlib import suppress
+from multiprocessing import Pipe
+
+import jax
+import numpy as np
+
+from hector_jax.cli import arguments
+from hector_jax.cli.flags import NAMED_WEIGHTS, View
+from hector_jax.control.reference import named_command
+from hector_jax.control.weights import Weights
+from hector_jax.core.console import Broken, say
+from hector_jax.core.inputs import InputError, require_package
+from hector_jax.core.runtime import start_process, workers
+from hector_jax.report.live import simulate
+from hector_jax.report.live_tuning import Tuner
+from hector_jax.report.live_weights import Setup
+from hector_jax.report.view import opened_server
+from hector_jax.report.view_live import serve_live
+from hector_jax.robot.model import Robot, compile_model, load_robot
+from hector_jax.sim.loop import Job
+from hector_jax.sim.world import WORLDS, named_world
+
+
+def run_live(args: View) -> None:
+    """Walk on a page until interrupted.
+
+    Raises:
+        InputError: a flag is not of a live walk, or the robot's controller is a user's own.
+        Broken: the process of the walk has ended.
+    """
+    for name in ("sets", "seconds", "out"):
+        if args.is_given(name):
+            raise InputError(f"--{name} is of a run, which does not walk --live")
+    if args.world not in WORLDS:
+        raise InputError(f"--live walks in {', '.join(WORLDS)}: it tunes; got {args.world}")
+    if len(args.weights) > 2:
+        raise InputError(f"--weights of a live walk are one or two, got {len(args.weights)}")
+    require_package("viser", "view", "the page")
+    robot = load_robot(args.robot)
+    if robot.description.numbers:
+        text = "[numbers] are of a controller of your own, whose program is not walked live"
+        raise InputError(f"{robot.description.path}: {text}")
+    names = arguments.short_names(args.weights)
+    sets = {names[text]: arguments.weights_by_name(text, robot) for text in args.weights}
+    plant = named_world(args.world, args.seed, robot.description)
+    command = named_command("straight")
+    jobs = [Job(weights, command, plant, seed=args.seed) for weights in sets.values()]
+
+    def line(files: Sequence[str], world: str, seed: int) -> str:
+        words = ["hector", "view", "--live", "--weights", *files]
+        words += ["--robot", str(args.robot)] if args.robot else []
+        return shlex.join([*words, "--world", world, "--seed", str(seed)])
+
+    model = compile_model(robot.description)
+    setup = Setup(
+        robot, model, sets, list(args.weights), _named(robot), args.world, args.seed, line
+    )
+    here, there = Pipe()
+    with workers(1) as pool, opened_server(args.host, args.port) as (server, address):
+        process = start_process(simulate, there, jax.tree.map(np.asarray, robot), jobs)
+        there.close()
+        say(f"open {address} in a browser; Ctrl-C ends it")
+        try:
+            serve_live(server, setup, here, Tuner(pool, jax.tree.map(np.asarray, robot)))
+        except (EOFError, ConnectionError):
+            raise Broken("the process in which the robot walks has ended") from None
+        finally:
+            process.kill()
+
+
+def _named(robot: Robot) -> dict[str, Weights]:
+    """Return the named sets that the robot has."""
+    found = {}
+    for name in NAMED_WEIGHTS:
+        with suppress(InputError):  # a robot may have no best set
+            found[name] = arguments.weights_by_name(name, robot)
+    return found

@@ -1,0 +1,70 @@
+"""Parts of the pages in the browser: floor, bodies of a robot, plots."""
+
+from collections.abc import Mapping
+from itertools import cycle
+from typing import Any
+
+import numpy as np
+
+from hector_jax.core.headless import mujoco
+from hector_jax.report.plots.style import rgb_of
+
+_DASHES = ([6, 4], [], [2, 3], [10, 3, 2, 3])  # of lines in plots: before, after, further sets
+
+
+def add_floor(scene: Any) -> Any:
+    """Add the frame of all that moves with the world under the camera, and the floor."""
+    world = scene.add_frame("/world", show_axes=False)
+    colours = {"cell_color": (224, 228, 233), "section_color": (196, 203, 211)}
+    colours |= {"plane_color": (241, 243, 246), "plane_opacity": 1.0}
+    scene.add_grid("/world/floor", 30.0, 30.0, **colours)
+    return world
+
+
+def plot(gui: Any, title: str, x_name: str, x: np.ndarray, lines: Mapping[str, np.ndarray]) -> Any:
+    """Add a plot to the panel."""
+    axes = {"scales": {"x": {"time": False}}, "axes": ({"label": x_name}, {}), "aspect": 2.0}
+    return gui.add_uplot((x, *lines.values()), series(x_name, lines), title=title, **axes)
+
+
+def series(x_name: str, names: Mapping[str, Any]) -> tuple[dict[str, Any], ...]:
+    """Return the looks of the lines of a plot, by the names of their sets."""
+    looks = zip(names, rgb_of(names), cycle(_DASHES), strict=False)
+    lines = ({"label": n, "stroke": f"rgb{c}", "dash": d, "width": 2} for n, c, d in looks)
+    return ({"label": x_name}, *lines)
+
+
+def body_meshes(model: mujoco.MjModel, accent: tuple[int, int, int]) -> dict[int, Any]:
+    """Make a mesh of the visible geoms of each body (geom groups 0 to 2).
+
+    Args:
+        model: model of the robot.
+        accent: colour for the material named "accent".
+    """
+    import trimesh
+    from trimesh.creation import box, capsule, cylinder, icosphere
+
+    kinds = mujoco.mjtGeom
+    solids = {  # from MuJoCo's sizes
+        kinds.mjGEOM_BOX: lambda size: box(extents=2.0 * size),
+        kinds.mjGEOM_CYLINDER: lambda size: cylinder(radius=size[0], height=2.0 * size[1]),
+        kinds.mjGEOM_CAPSULE: lambda size: capsule(radius=size[0], height=2.0 * size[1]),
+        kinds.mjGEOM_SPHERE: lambda size: icosphere(subdivisions=2, radius=size[0]),
+        kinds.mjGEOM_ELLIPSOID: lambda size: icosphere(subdivisions=2).apply_scale(size),
+    }
+    meshes: dict[int, list[Any]] = {}
+    for geom in map(model.geom, range(model.ngeom)):
+        body, kind, material = geom.bodyid[0], kinds(geom.type[0]), geom.matid[0]
+        if body == 0 or geom.group[0] > 2 or kind not in solids:
+            continue
+        mesh = solids[kind](geom.size)
+        if kind in (kinds.mjGEOM_BOX, kinds.mjGEOM_CYLINDER):
+            mesh.unmerge_vertices()  # draws sharp edges
+        rgba = model.mat_rgba[material] if material >= 0 else geom.rgba
+        if material >= 0 and model.material(material).name == "accent":
+            rgba = np.array([*accent, 255]) / 255.0
+        mesh.apply_transform(trimesh.transformations.quaternion_matrix(geom.quat))
+        mesh.apply_translation(geom.pos)
+        mesh.visual.vertex_colors = np.round(255.0 * np.asarray(rgba)).astype(np.uint8)
+        meshes.setdefault(int(body), []).append(mesh)
+    return {body: trimesh.util.concatenate(parts) for body, parts in meshes.items()}

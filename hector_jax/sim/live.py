@@ -1,0 +1,195 @@
+"""A walk in MuJoCo C that goes on until it falls, while its numbers change.
+
+Untouched it is that of `sim.walk`, to the bit. Weights change between two plans. A new command
+starts at the reference of the old one, so that the robot is asked for no jump. Estimator noise
+repeats itself after some seconds.
+"""
+
+from collections import deque
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from hector_jax.control.controller import Plan, WalkConfig
+from hector_jax.control.reference import Anchor, Command, reference_at, with_pieces
+from hector_jax.core.headless import mujoco
+from hector_jax.core.trajectory import Trajectory
+from hector_jax.robot.mjcf import TIME_STEP
+from hector_jax.robot.model import Robot, quiet_mujoco
+from hector_jax.sim import sensing
+from hector_jax.sim.diagnosis import BEFORE_FALL, Recorder, likeliest_cause
+from hector_jax.sim.loop import Job, Sample, as_trajectory, first_tick
+from hector_jax.sim.mujoco_plant import MujocoPlant
+from hector_jax.sim.walk import BLOCK, Stepper, joined
+from hector_jax.sim.world import World, build_world
+
+WINDOW = 4.0  # [s] that are remembered
+PUSH_TIME = 0.2  # [s]
+_NOISE = 20_000  # [ms] after which the estimator's noise repeats itself
+_RECORD = round((BEFORE_FALL + 1.0) / TIME_STEP)  # [ms] before a fall that its cause is found from
+
+_feet = jax.jit(lambda robot, row: sensing.foot_points(robot, sensing.unpack_reading(row)))
+
+
+class Now(NamedTuple):
+    """What a walk is at, in the world frame."""
+
+    time: float  # [s] after t = 0
+    pose: Float[np.ndarray, " nq"]  # of a robot without backlash, as MuJoCo's qpos
+    reference: Float[np.ndarray, "3"]  # of the centre of mass [m]
+    feet: Float[np.ndarray, "feet 3"]  # foot points [m]
+    planned: Float[np.ndarray, "feet 3"]  # force of the ground on each foot [N]
+    measured: Float[np.ndarray, "feet 3"]  # over the last tick [N]
+    residual: float  # of the QP, relative
+    fall: str  # time and likeliest cause; empty while it walks
+    seconds: float  # that the errors are of; 0 before t = 0
+    errors: Float[np.ndarray, "6"]  # RMS: x, y, z [cm], roll, pitch, yaw [degrees]
+    error: Float[np.ndarray, "6"]  # at the last sample
+
+
+class LiveWalk:
+    """A walk of one weight set."""
+
+    @quiet_mujoco()
+    def __init__(self, config: WalkConfig, robot: Robot, job: Job, payload: float = 0.0) -> None:
+        """Walk the first tick from standing; a `payload` [kg] sits in the trunk's centre."""
+        self._config, self._robot, self.job, self.fall = config, robot, job, ""
+        length = round(BLOCK * config.gait.tick / TIME_STEP)
+        self._plant = MujocoPlant(job, robot, 0, length, on_step=self._log_step)
+        self._states, self._forces = deque(maxlen=_RECORD // 10), deque(maxlen=_RECORD)
+        self._stepper = Stepper(config, robot, job, self._plant)
+        self.set_plant(job, payload)
+        self._ticks = round(WINDOW / config.gait.tick)
+        self._blocks: deque[tuple[Plan, Sample]] = deque()  # at least WINDOW and a tick
+        self._away = np.full((1, 6), np.nan)  # errors of the last samples
+        self._squares: deque[np.ndarray] = deque(maxlen=self._ticks)  # of errors, from t = 0
+        self._lead = (job.start_tick - first_tick(config)) * self._stepper.count
+        joints, noise = len(robot.joint_lower), job.imperfections.estimator
+        self._errors = sensing.draw_errors(noise, joints, job.seed, self._lead, _NOISE)
+        self._push, self._pushed, self._pending = np.zeros(3), 0, 0
+        self.tick()  # so that there is a plan
+
+    @property
+    def anchor(self) -> Anchor:
+        """Where the reference of the command starts."""
+        return self._stepper.anchor
+
+    @property
+    def clock(self) -> int:
+        """The next gait tick."""
+        return self._stepper.clock
+
+    @property
+    def sampled_to(self) -> int:
+        """The gait tick after the last of `trajectory`."""
+        return self.clock - self._pending
+
+    def tick(self) -> None:
+        """Walk to the next plan; nothing after a fall."""
+        if self.fall:
+            return
+        count = self._stepper.count
+        step = (self.clock - first_tick(self._config)) * count + np.arange(count)
+        rows = np.where(step < self._lead, step, self._lead + (step - self._lead) % _NOISE)
+        self._states.append(self._plant.state())
+        self._stepper.tick(self._errors[rows], np.tile(self._push * (self._pushed > 0), (count, 1)))
+        self._pushed, self._pending = self._pushed - 1, self._pending + 1
+        if self._pending == BLOCK or self._plant.broken:
+            self._sample()
+
+    def set_job(self, job: Job) -> None:
+        """Go on with other weights, and the same command and plant."""
+        self.job = job
+        self._stepper.set_job(job)
+
+    def set_command(self, command: Command) -> None:
+        """Go on with another command, which starts where the reference is now."""
+        self._sample()
+        if self.clock > self.job.start_tick:
+            old = with_pieces(self.job.command)
+            at = jax.device_get(
+                reference_at(self._config.gait.tick, old, self.anchor, float(self.clock))
+            )
+            self._stepper.set_anchor(Anchor(at.position, at.euler[2], np.int32(self.clock)))
+        self.set_job(self.job._replace(command=command))
+
+    def set_plant(self, job: Job, payload: float) -> None:
+        """Go on with other numbers of the plant, that has no other parts."""
+        world = build_world(job.imperfections, self._robot.description, sensors=True)
+        world.model.body_mass[world.trunk] += payload
+        mujoco.mj_setConst(world.model, mujoco.MjData(world.model))
+        self._plant.world = world
+        self.set_job(job)
+
+    def push(self, force: Float[np.ndarray, "3"]) -> None:
+        """Push the trunk [N] for PUSH_TIME, as the robot faces: ahead, left, up."""
+        yaw = 2.0 * np.arctan2(*self._stepper.reading[[6, 3]])
+        c, s = np.cos(yaw), np.sin(yaw)
+        self._push = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ force
+        self._pushed = round(PUSH_TIME / self._config.gait.tick)
+
+    def _sample(self) -> None:
+        """Sample the ticks since the last sample; find the cause if it fell."""
+        if not self._pending:
+            return
+        plans, samples = self._stepper.samples()
+        count, self._pending = self._stepper.count, 0
+        self._blocks.append((plans, samples))
+        while sum(len(p.residual) for p, _ in list(self._blocks)[1:]) > self._ticks:
+            self._blocks.popleft()
+        away = np.hstack([samples.state.position, samples.state.euler])
+        away -= np.hstack([samples.reference.position, samples.reference.euler])
+        away *= [100.0] * 3 + [np.degrees(1.0)] * 3
+        self._away = away
+        squares = (away**2).reshape(len(plans.residual), count, 6)
+        first = self.clock - len(plans.residual) - self.job.start_tick
+        self._squares.extend(squares[max(-first, 0) :] if not samples.fallen.any() else ())
+        if samples.fallen.any() or self._plant.broken:
+            when = (self.clock - self.job.start_tick) * self._config.gait.tick
+            self.fall = f"fell after {when:.1f} s: {self._cause()}"
+
+    def _log_step(self, world: World, data: mujoco.MjData) -> None:
+        self._forces.append((data.ctrl.copy(), data.xfrc_applied[world.trunk, :3].copy()))
+
+    def _cause(self) -> str:
+        """Find the likeliest cause of a fall: a record of every step would slow the walk down."""
+        recorder = Recorder(self._robot, self._robot)
+        count = self._stepper.count
+        ticks = min(len(self._states), len(self._forces) // count)
+        forces = list(self._forces)[-ticks * count :]
+        self._plant.replay(self._states[-ticks], forces, recorder.note)
+        return likeliest_cause(self._robot, recorder.record(self.trajectory()))
+
+    def trajectory(self) -> Trajectory:
+        """Return the last WINDOW seconds; fewer if there are fewer."""
+        plans, samples = (joined(parts) for parts in zip(*self._blocks, strict=True))
+        count, ticks = self._stepper.count, min(self._ticks, len(plans.residual) - 1)
+        plans = jax.tree.map(lambda x: x[-ticks:], plans)
+        samples = jax.tree.map(lambda x: x[-ticks * count - 1 :], samples)
+        return as_trajectory(np.array(TIME_STEP), plans, samples, count)
+
+    def now(self) -> Now:
+        """Return where the walk is."""
+        reading, stepper = sensing.unpack_reading(self._stepper.reading), self._stepper
+        errors = np.full(6, np.nan)
+        if self._squares:
+            errors = np.sqrt(np.mean(self._squares, axis=(0, 1)))
+        planned = stepper.last_plan
+        tick = self._config.gait.tick
+        command = with_pieces(self.job.command)
+        reference = reference_at(tick, command, self.anchor, float(self.clock))
+        return Now(
+            time=(self.clock - self.job.start_tick) * tick,
+            pose=np.concatenate([reading.pose, reading.joints + reading.slack]),
+            reference=np.asarray(reference.position),
+            feet=np.asarray(_feet(self._robot, stepper.reading)),
+            planned=planned.wrench.force,
+            measured=self._plant.mean_force(stepper.count),
+            residual=float(planned.residual),
+            fall=self.fall,
+            seconds=len(self._squares) * tick,
+            errors=errors,
+            error=self._away[-1],
+        )

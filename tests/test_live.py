@@ -1,0 +1,200 @@
+"""A live walk: the walk of `hector walk`, without compiling; its page; steps of the tuner."""
+
+import re
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+from browser import CHROMIUM, opened
+from model import EXAMPLES, ROBOT
+from pretend import refused
+
+from hector_jax import Job, walk
+from hector_jax.control.controller import walk_config
+from hector_jax.control.reference import named_command
+from hector_jax.control.weights import expert, nominal, weights_to_vector
+from hector_jax.control.weights_file import best, load_weights
+from hector_jax.report.live import Session, count_compilations
+from hector_jax.report.live_tuning import take_step, what_matters
+from hector_jax.sim.world import hfs, hfs_even
+
+PLANT = hfs(ROBOT.description)
+
+
+def job(weights=None, plant=PLANT, seed=0):
+    return Job(weights or nominal(ROBOT), named_command("straight"), plant, seed=seed)
+
+
+@pytest.fixture(scope="module")
+def session():
+    """A session of `best` that has walked for four seconds."""
+    found = Session(ROBOT, [job(best(ROBOT))])
+    go(found, 4.0)
+    return found
+
+
+def go(session, seconds):
+    """Walk until this time after t = 0, or a fall; the last frame."""
+    while session.frame()[0][0].time < seconds and not session.walks[0].fall:
+        session.tick()
+    return session.frame()[0][0]
+
+
+@pytest.mark.parametrize("plant", [PLANT, hfs_even(3, ROBOT.description)], ids=["hfs", "noise"])
+def test_an_untouched_live_walk_is_the_walk_to_the_bit(plant):
+    asked = job(plant=plant, seed=3)
+    found = Session(ROBOT, [asked])
+    now = go(found, 4.0)
+    wanted, lived = walk(walk_config(ROBOT), ROBOT, asked), found.walks[0].trajectory()
+    jax.tree.map(partial(np.testing.assert_array_equal, strict=True), lived, wanted)
+    away = wanted.state.position - wanted.reference.position
+    np.testing.assert_allclose(now.errors[:3], 100.0 * np.sqrt(np.mean(away**2, axis=0)))
+
+
+def test_nothing_compiles_while_a_person_turns_and_both_sets_walk_on_one_plant():
+    found = Session(ROBOT, [job(), job(best(ROBOT))])
+    found.warm_up()
+    compilations = count_compilations()
+    go(found, 0.3)
+    found.set_weights(0, expert(ROBOT))
+    found.set_velocity(0.3, 0.1, 0.2)
+    found.set_plant(PLANT._replace(mass=np.asarray(1.05), delay=np.asarray(0.003)), 1.0)
+    found.push(np.array([0.0, 30.0, 0.0]))
+    go(found, 0.8)
+    found.reset()
+    frames = [go(found, 0.2), *found.frame()[0]]
+    assert compilations() == 0
+    masses = {float(x._plant.world.model.body_mass.sum()) for x in found.walks}
+    assert len(masses) == 1
+    assert masses.pop() == pytest.approx(1.05 * float(ROBOT.mass) + 1.0, rel=0.02)
+    assert not any(now.fall for now in frames)
+
+
+def test_a_small_push_is_survived_and_a_large_one_ends_in_a_fall_with_its_cause(session):
+    end = session.walks[0].now().time
+    session.push(np.array([60.0, 0.0, 0.0]))
+    assert go(session, end + 2.0).fall == ""
+    session.push(np.array([300.0, 0.0, 0.0]))
+    now = go(session, end + 6.0)
+    assert re.match(r"fell after \d\.\d s: .+ \(try ", now.fall)
+    assert session.log(0) == "it fell: reset"
+    session.reset()
+    assert go(session, 0.5).fall == ""
+
+
+def test_weights_change_the_errors_and_those_of_the_start_stay_beside_them():
+    found = Session(ROBOT, [job(best(ROBOT))])
+    before = go(found, 2.0).errors
+    found.set_weights(0, nominal(ROBOT))
+    now = go(found, 6.5)
+    np.testing.assert_array_equal(found.frame()[1][0], before)
+    assert now.errors[4] > 3.0 * before[4]  # pitch
+
+
+def test_a_new_command_starts_at_the_old_reference(session):
+    session.reset()
+    before = go(session, 1.0).reference
+    session.set_velocity(0.0, 0.2, 0.0)
+    after = session.walks[0].now().reference
+    np.testing.assert_allclose(after, before, atol=1e-9)
+    moved = go(session, 2.0).reference - after
+    np.testing.assert_allclose(moved, [0.0, 0.2, 0.0], atol=0.01)
+
+
+@pytest.mark.slow
+def test_one_step_of_the_tuner_moves_the_weights_of_the_walk_just_seen():
+    found = Session(ROBOT, [job()])
+    go(found, 2.0)
+    assert found.log(0) == "2.0 s more with nothing moved"
+    before = go(found, 5.0).errors
+    walked = found.log(0)
+    assert walked.start_tick == 100
+    state, weights, text = take_step(ROBOT, None, walked)
+    assert text.startswith("L of these 4 s: ")
+    assert " One step: " in text
+    step = np.log(weights_to_vector(weights) / weights_to_vector(nominal(ROBOT)))
+    assert 0.1 < np.abs(step).max() <= 1.0 + 1e-6
+    found.set_weights(0, weights)
+    now = go(found, 9.5)
+    assert np.linalg.norm(now.errors[:2]) < np.linalg.norm(before[:2])
+    assert int(take_step(ROBOT, state, found.log(0))[0].iteration) == 2
+    said = what_matters(ROBOT, walked).splitlines()[2:]
+    assert said
+    assert all(re.match(r"- `[QR]_\w+`.*, doubled: \w+ [+-]\d+ %, ", line) for line in said)
+
+
+def test_what_is_not_live_is_refused_in_a_line(monkeypatch, capsys, tmp_path):
+    line = partial(refused, monkeypatch, capsys, "view")
+    assert "--live takes no RUN" in line(tmp_path, "--live")
+    assert "RUN expects a value, got none; or --live" in line()
+    assert "--robot is of a live walk: --live" in line(
+        tmp_path, "--robot", EXAMPLES / "quadruped/robot.toml"
+    )
+    assert "--seconds is of a run" in line("--live", "--seconds", 2)
+    assert "it tunes; got standin" in line("--live", "--world", "standin")
+    own = EXAMPLES / "own_controller" / "numbers.toml"
+    assert "whose program is not walked live" in line("--live", "--robot", own)
+    assert "no flag '--walker'" in line("--live", "--walker", own)
+
+
+def until(seconds, seen):
+    end = time.monotonic() + seconds
+    while not (found := seen()):
+        assert time.monotonic() < end, f"not seen within {seconds} s"
+        time.sleep(1.0)
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
+def test_a_person_turns_pushes_and_saves_in_a_browser(tmp_path):
+    pytest.importorskip("viser", reason="viser, of the extra view, is not installed")
+    words = [sys.executable, "-m", "hector_jax.cli.main", "view", "--live", "--port", "0"]
+    words += ["--weights", "best"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": tmp_path}
+    with subprocess.Popen(words, **pipes) as page:
+        try:
+            address = next(line for line in page.stderr if line.startswith("open http")).split()[1]
+            with (
+                opened(address, tmp_path / "one") as tab,
+                opened(address, tmp_path / "two") as other,
+            ):
+
+                def at(what, one=tab):
+                    return re.search(what, one.text())
+
+                def pitch():
+                    row = at(r"best now\s+\S+, \S+, \S+\s+\S+, ([\d.]+), ")
+                    return float(row[1]) if row else None
+
+                until(300, lambda: at(r"best: [5-9]\.\d s; QP solved"))
+                before = until(60, pitch)
+                tab.fill("Q_pitch", "-2")
+                until(60, lambda: at(r"Q_pitch = 0\.01"))
+                until(60, lambda: at(r"Q_pitch = 0\.01", other))
+                until(120, lambda: pitch() > 1.3 * before)
+                tab.click("Undo")
+                tab.click("from behind")
+                now = float(at(r"best: ([\d.]+) s;")[1])
+                until(120, lambda: float(at(r"best: ([\d.]+) s;")[1]) > now + 3.0)
+                tab.fill("push [N]", "300")
+                tab.click("from behind")
+                until(120, lambda: at("best: fell after"))
+                until(30, lambda: at("best: fell after", other))
+                tab.click("Reset: stand at the start again")
+                until(60, lambda: at(r"best: -?[0-3]\.\d s; QP solved"))
+                tab.click("Save these weights")
+                until(30, lambda: at("hector view --live --weights live.json"))
+                saved = load_weights(tmp_path / "live.json", ROBOT)
+                np.testing.assert_array_equal(
+                    weights_to_vector(saved), weights_to_vector(best(ROBOT))
+                )
+        finally:
+            page.send_signal(signal.SIGINT)
+        page.communicate(timeout=60)
+    assert page.returncode == 130
