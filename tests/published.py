@@ -1,9 +1,12 @@
 """Robots as others publish them: a small biped as MJCF, and compiled bodies as a URDF."""
 
 import re
+import struct
 
 import mujoco
 import numpy as np
+import trimesh
+from scipy.spatial import ConvexHull
 
 from hector_jax.robot.description import Description, Foot
 
@@ -89,6 +92,25 @@ def small(folder, ankle=-0.3, contacts=CONTACTS, **changes):
     fields |= {"weld": ("waist", "shoulder"), "standing": tuple(angles.items())}
     fields["feet"] = tuple(Foot(None, contacts, f"{s}_foot") for s in SIDES)
     return Description(**fields | changes)
+
+
+def write_box(path, half):
+    """A box of half these sides as a mesh's file: STL, OBJ, DAE or MuJoCo's MSH."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half
+    if path.suffix == ".msh":
+        path.write_bytes(struct.pack("<4i", 8, 0, 0, 0) + corners.astype("<f4").tobytes())
+    elif path.suffix == ".dae":
+        numbers = " ".join(map(str, 0.001 * corners.ravel()))  # scaled back by the scene's node
+        path.write_text(
+            '<COLLADA xmlns="c"><asset><unit meter="1"/></asset><library_geometries>'
+            f'<geometry id="g"><mesh><source id="s"><float_array>{numbers}</float_array></source>'
+            '<vertices><input semantic="POSITION" source="#s"/></vertices></mesh></geometry>'
+            "</library_geometries><visual_scene><node><rotate>0 1 0 90</rotate><rotate>0 1 0 -90"
+            '</rotate><scale>1000 1000 1000</scale><instance_geometry url="#g"/></node>'
+            "</visual_scene></COLLADA>"
+        )
+    else:
+        trimesh.Trimesh(corners, ConvexHull(corners).simplices).export(path)
 
 
 def place(pos, quat):

@@ -15,7 +15,11 @@ APPLICATION = "importing own store verdict walk_tuning export report cli __main_
 FLOOR = {room: height for height, room in enumerate([*METHOD, *APPLICATION])}
 DOORS = {"mujoco": ("core.headless", "sim.mjx_model"), "pydrake": ("sim.drake",)}
 DOORS |= {"pinocchio": ("sim.pinocchio",), "coal": ("sim.pinocchio",)}
-DOORS |= {"viser": ("report.view",), "trimesh": ("report.view",), "flax": ("grfm.nets",)}
+DOORS |= {
+    "viser": ("report.view",),
+    "trimesh": ("report.view", "importing.meshes"),
+    "flax": ("grfm.nets",),
+}
 DOORS |= {"optax": ("grfm.nets", "tuning.difftune", "tuning.step_rules")}
 DOORS |= {"jaxopt": ("qp.jaxopt_solver",)}
 DOORS |= {"matplotlib": ("report.plots",), "tyro": ("cli.parse",)}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from model import EXAMPLES
 from pretend import call
-from published import JOINTS, replaced, small
+from published import JOINTS, SIDES, replaced, small, write_box
 
 from hector_jax import InputError, walk_config
 from hector_jax.core.settings import as_toml
@@ -107,8 +107,6 @@ REFUSED = [  # what is told, and changes of the small biped
         ('axis="1 0 0"', 'axis="0 -1 0"'),
         (r'(name="\w+_(pitch|knee|ankle)") axis="0 1 0"', r'\1 axis="1 0 0"'),
     ),
-    ("'left_roll' has no range, nor have left_pitch, left_knee, ", (' range="[^"]*"', "")),
-    ("'left_roll' has no torque limit, nor have left_pitch, .*joints.weld", (MOTORS, "")),
     ("right_ankle turn without end, as wheels do", (r'(_ankle.*) range="-1 1"', r"\1")),
     ("right_ankle turn .* another unit: rad", (r'(_ankle.*) range="-1 1"', r'\1 range="10 60"')),
     (r"expected it in its range \[10. 16.\]", (r'(_ankle.*) range="-1 1"', r'\1 range="10 16"')),
@@ -122,6 +120,130 @@ def test_a_robot_that_cannot_be_used_is_refused_with_the_reason(tmp_path, case):
     proposal = propose_robot(edited(tmp_path, *changes))
     assert re.search(text, proposal.error)
     assert proposal.error in proposal.wrong
+
+
+GUESSED = [  # what is told of a proposal that can be used, and changes of the small biped
+    ("'left_roll' has no range, nor have left_pitch, left_knee, .*guess", (' range="[^"]*"', "")),
+    ("'left_knee' has no range, nor have right_knee: half", ('(_knee.*) range="[^"]*"', r"\1")),
+    ("'left_roll' has no torque limit, nor have left_pitch, .*joints.weld", (MOTORS, "")),
+    (
+        "body 'left_foot' is guessed .*, no shape .* it has no mesh: .* cm long, .*measure heel",
+        (r'\n *<geom type="box" size="0.06 0.03 0.01".*', ""),
+        (r'<geom type="sphere".*', ""),
+        (r'<body name="\w+_cap"[^>]*>\s*</body>', ""),
+    ),
+]
+
+
+@pytest.mark.parametrize("case", GUESSED, ids=lambda case: case[0])
+def test_what_a_file_does_not_have_is_guessed_and_told(monkeypatch, capsys, tmp_path, case):
+    text, *changes = case
+    path, out = edited(tmp_path, *changes), tmp_path / "new" / "robot.toml"
+    assert call(monkeypatch, "robot", path, "--out", out) == 0
+    assert re.search(text, capsys.readouterr().out)
+    assert re.search(f"(?m)^# A guess: .*{text}", out.read_text())
+    assert load_robot(out).torque_limit.min() > 0.0
+
+
+MENDED = [  # a note, and changes of the small biped
+    (
+        "<flag> of <option> not used",
+        ("<asset>", '<option><flag sensornoise="enable"/></option><asset>'),
+    ),
+    ("moments .* a ball's: left_foot", ("(?s)(left_foot.*?)0.0002 0.0003 0.0002", r"\g<1>0 0 0")),
+    (
+        "moments .* the mean.*: left_foot",
+        ("(?s)(left_foot.*?)0.0002 0.0003", r"\g<1>0.0009 0.0003"),
+    ),
+    ("not used", ("<compiler", '<compiler coordinate="local"')),
+]
+
+
+@pytest.mark.parametrize("case", MENDED, ids=lambda case: case[0])
+def test_what_does_not_matter_is_mended_and_told(tmp_path, case):
+    text, *changes = case
+    own = propose_robot(edited(tmp_path))
+    proposal = propose_robot(edited(tmp_path, *changes))
+    assert proposal.wrong == ()
+    assert re.search(text, "\n".join(build_spec(proposal.robot.description).notes))
+    assert proposal.robot.mass == pytest.approx(float(own.robot.mass))
+
+
+def test_files_beside_a_model_are_included_and_others_are_not(tmp_path):
+    whole = propose_robot(edited(tmp_path))
+    path = edited(tmp_path)
+    text = path.read_text()
+    motors = re.search(MOTORS, text)[0]
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "motors.xml").write_text(f"<mujoco>{motors}</mujoco>")
+    for file, error in (
+        ("parts/motors.xml", None),
+        ("../motors.xml", "<include> of '../motors.xml' is not accepted, expected a file beside"),
+        ("robot.xml", "that is included once"),
+    ):
+        path.write_text(text.replace(motors, f'<include file="{file}"/>'))
+        proposal = propose_robot(path)
+        assert error is None or error in proposal.error
+        assert error or proposal.table == whole.table
+
+
+def test_legs_that_hang_at_the_world_have_it_as_their_trunk(tmp_path):
+    path = edited(tmp_path)
+    (start,) = re.findall('<body name="base".*?>', path.read_text())
+    floor = '<geom type="plane" size="1 1 1" pos="0 0 -3"/>'
+    edited_text = path.read_text().replace(start + "<freejoint/>", floor)
+    edited_text = re.sub('(?s)<inertial pos="0.01 0 0.05".*?/>', "", edited_text)
+    box = '<geom type="box" size="0.05 0.08 0.1"/>'
+    edited_text = edited_text.replace(box, box.replace("/>", ' mass="4"/>'))
+    path.write_text(re.sub(r"</body>(\s*</worldbody>)", r"\1", edited_text))
+    proposal = propose_robot(path)
+    assert proposal.wrong == ()
+    assert proposal.table["joints"]["left"] == JOINTS[:4]
+    assert proposal.robot.mass == pytest.approx(12.12, abs=0.01)
+
+
+TOE = '<body name="{0}_toes" pos="0.06 0 0"><joint name="{0}_toe" axis="0 1 0" range="-1 1"/>'
+TOE += '<inertial pos="0 0 0" mass="0.05" diaginertia="1e-5 1e-5 1e-5"/></body>'
+ROD = '<equality><joint joint1="left_ankle" joint2="left_toe"/></equality>'
+
+
+def test_a_joint_that_is_welded_is_of_no_leg_and_frees_what_is_coupled_to_it(
+    monkeypatch, capsys, tmp_path
+):
+    own = propose_robot(edited(tmp_path))
+    toes = [(f'(<body name="{s}_cap")', TOE.format(s) + r"\1") for s in SIDES]
+    path = edited(tmp_path, *toes, more=ROD)
+    assert call(monkeypatch, "robot", path) == 2
+    assert "couples left_ankle, left_toe" in capsys.readouterr().err
+    out = tmp_path / "new" / "robot.toml"
+    assert call(monkeypatch, "robot", path, "--out", out, "--weld", "left_toe", "right_toe") == 0
+    assert read_description(out).joints == own.robot.description.joints
+    assert call(monkeypatch, "robot", path, "--weld", "left_tow") == 2
+    assert "no joint 'left_tow'; did you mean 'left_toe'?" in capsys.readouterr().err
+
+
+def test_soles_are_measured_on_the_lowest_facets_of_meshes(monkeypatch, capsys, tmp_path):
+    """A box, 12 x 6 x 2 cm, as the STL, OBJ, DAE and MSH of a foot, and tilted by 0.2 rad."""
+    for suffix in ("stl", "obj", "dae", "msh"):
+        for tilt in (0.0, 0.2):
+            folder = tmp_path / f"{suffix}{tilt}"
+            (folder / "meshes").mkdir(parents=True)
+            write_box(folder / "meshes" / f"sole.{suffix}", (60.0, 30.0, 10.0))
+            mesh = (
+                f'<mesh name="sole" file="sole.{suffix}" scale="1e-3 1e-3 1e-3"/><mesh name="arm"'
+            )
+            geom = f'<geom type="mesh" mesh="sole" pos="0.01 0 -0.03" euler="0 {tilt} 0"/>'
+            changes = [('<mesh name="arm"', mesh), (BOX, geom), (CAP, ""), ("../meshes", "meshes")]
+            path = edited(folder, *changes, (r'<body name="\w+_cap"[^>]*>\s*</body>', ""))
+            proposal, shape = propose_robot(path), BOX.replace("/>", f' euler="0 {tilt} 0"/>')
+            assert (proposal.wrong, proposal.guesses) == ((), ())
+            plain = edited(tmp_path, (BOX, shape), (CAP, ""))
+            for sole, expected in zip(proposal.soles, find_soles(survey_file(plain)), strict=True):
+                assert sole.files == (f"sole.{suffix}",)
+                np.testing.assert_allclose(sole.contacts, expected.contacts, atol=2e-4)
+                np.testing.assert_allclose(sole.axes, expected.axes, atol=1e-6)
+    assert call(monkeypatch, "robot", path) == 0
+    assert "mended   soles measured on sole.msh" in capsys.readouterr().out
 
 
 def test_a_file_for_another_robot_names_the_command(tmp_path):
@@ -285,20 +407,16 @@ BOX = '<geom type="box" size="0.06 0.03 0.01" pos="0.01 0 -0.03"/>'
 CAP = '<geom type="sphere" size="0.005" mass="0.01"/>'
 
 
-def test_soles_of_meshes_are_asked_for(monkeypatch, capsys, tmp_path):
-    draft, out = tmp_path / "draft.toml", tmp_path / "robot.toml"
-    path = edited(tmp_path, (BOX, ""), (CAP, ""), (r'<body name="\w+_cap"[^>]*>\s*</body>', ""))
-    proposal = propose_robot(path)
-    assert all(sole.guessed for sole in proposal.soles)
-    (line,) = [line for line in proposal.wrong if "guessed" in line]
-    assert line.startswith("no box, sphere, capsule or cylinder of body 'left_foot' collides")
-    assert line.endswith("measure the sole and correct feet.left and feet.right")
+def test_a_draft_stands_beside_the_model_that_it_means(monkeypatch, capsys, tmp_path):
+    draft = tmp_path / "draft.toml"
+    path = edited(tmp_path, ("0.004 0.004 0.001", "0 0.004 0.001"))
     assert call(monkeypatch, "robot", path, "--out", draft) == 2
     err = capsys.readouterr().err
     assert f"the proposal is in {draft}; mend it, then: hector robot {draft}" in err
+    line = propose_robot(path).wrong[-1]
     assert err.endswith(f"hector: {line}\n")
     assert f"# To be mended: {line}" in draft.read_text()
-    assert read_description(draft).model == path
+    assert tomllib.loads(draft.read_text())["model"] == path.name
     # beside another robot's model of this name, the draft would mean that one
     other = tmp_path / "other" / path.name
     other.parent.mkdir()
@@ -306,10 +424,6 @@ def test_soles_of_meshes_are_asked_for(monkeypatch, capsys, tmp_path):
     assert call(monkeypatch, "robot", path, "--out", other.with_name("draft.toml")) == 2
     assert f"{other}, which must be a new file" in capsys.readouterr().err
     assert [file.name for file in other.parent.iterdir()] == [other.name]
-    # whoever leaves the contacts as they are takes them
-    assert call(monkeypatch, "robot", draft, "--out", out) == 0
-    assert f"walk with it: hector walk --robot {out}" in capsys.readouterr().err
-    assert read_description(out).model == tmp_path / "robot-standard.xml"
 
 
 def test_wrenches_act_in_the_middle_of_a_sole_which_may_be_a_tilted_box(

@@ -108,13 +108,13 @@ def run_robot(args: flags.Robot) -> None:
             raise InputError(f"--out must end in .toml, got {str(out)!r}")
         if out.exists():
             raise InputError(f"--out must be a new file, and {out} exists")
-    proposal = propose_robot(file)
-    robot, lines, told, wrong = proposal.robot, [], [], list(proposal.wrong)
+    proposal = propose_robot(file, args.weld)
+    robot, lines, told, wrong = proposal.robot, [], list(proposal.guesses), list(proposal.wrong)
     if file.suffix == ".toml":
         with suppress(InputError):  # it does not say enough to walk: what the rules make of it
             robot = load_robot(file)
     if robot is not None:
-        lines, told = table_of(robot), remarks(robot)
+        lines, told = table_of(robot), [*told, *remarks(robot)]
         if proposal.error is None:
             try:
                 loss_of_robot(robot.description)
@@ -124,12 +124,15 @@ def run_robot(args: flags.Robot) -> None:
                     lines += section("delay", delay)
             except InputError as error:  # a setting that controller or loss refuse
                 wrong.append(str(error))
-        lines += section("mended", changes_of_model(robot))
+        files = [x for x in proposal.soles[:1] if x.files]
+        measured = [f"soles measured on {', '.join(x.files)}" for x in files]
+        lines += section("mended", [*measured, *changes_of_model(robot)])
     if file.suffix == ".toml" and proposal.filled:
         lines += section("left out", [f"{', '.join(proposal.filled)}: HECTOR's, by the rules"])
     print("\n".join([*lines, *section("wrong", [*told, *wrong])]))
     head = f"Proposed by `hector robot {file.name}`; rules: docs/robot-toml.md."
     comments = [head, *(f"To be mended: {line}" for line in [*told, *wrong] if wrong)]
+    comments += [f"A guess: {line}" for line in proposal.guesses if not wrong]
     if out is not None:
         _write_robot(out, proposal, comments, file)
         next_step = "mend it, then: hector robot" if wrong else "walk with it: hector walk --robot"

@@ -338,6 +338,7 @@ class Robot(Flags):
 
     file: Annotated[Path, PathKind.FILE]  # MJCF, URDF, or the TOML file of a robot
     out: Path | None = None  # new file for the proposal, with its model; else it is printed
+    weld: tuple[str, ...] = ()  # joints to fix, as toes and the rods of parallel ankles
 
 
 @_command

@@ -29,6 +29,7 @@ of mass m and height h:
 """
 
 import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,6 +43,7 @@ from hector_jax.importing.stand import standing_pose
 from hector_jax.importing.survey import Survey, survey_file
 from hector_jax.robot.checks import expect
 from hector_jax.robot.description import MAX_BYTES, Description, Joints, description_of
+from hector_jax.robot.links import data_at, subtree
 from hector_jax.robot.model import Robot, build_model, conversion, robot_of
 from hector_jax.robot.response import (
     Response,
@@ -50,12 +52,16 @@ from hector_jax.robot.response import (
     swing_frequency,
     trunk_gain,
 )
+from hector_jax.robot.source import nor, without_limits
 
 MASS, HEIGHT = 12.0, 0.423  # of HECTOR [kg], [m]
 _TICK = 0.01  # [s] of the gait
 _ANGLE, _RATE = 50.0, 1.0  # weights Q of attitude and angular velocity
 _KP_PER_LIMIT = 2.0  # [1/rad]
 _NAMES = ("name", "model", "standing", "joints", "feet")  # what is found, not ruled
+_OF_FILE = ("weld", "armature", "range", "torque")  # of a model that is not in the standard form
+_HALF_TURN = 3.14  # [rad]: range of a joint that has none
+_TORQUE = 0.6  # torque limit of a joint that has none, by weight and length of a leg; HECTOR 0.6
 _ARMATURE_PER_LIMIT = 2e-4  # [s^2]: HECTOR's has 2.4e-4, Unitree's robots 1e-4 to 4e-4
 
 
@@ -64,15 +70,20 @@ class RobotProposal(NamedTuple):
 
     table: dict[str, Any]
     wrong: tuple[str, ...]  # one line per problem to correct by hand
-    filled: list[str]  # keys that the file does not have, which are proposed
+    guesses: tuple[str, ...] = ()  # one line per number that the file does not have
+    filled: Sequence[str] = ()  # keys that the file does not have, which are proposed
     survey: Survey | None = None  # None: the file names all, or it has no legs
     soles: tuple[Sole, ...] = ()
     robot: Robot | None = None  # None: it cannot be built
     error: str | None = None  # why the robot cannot be used
 
 
-def propose_robot(path: Path) -> RobotProposal:
+def propose_robot(path: Path, weld: Sequence[str] = ()) -> RobotProposal:
     """Return the proposed TOML of a model's file, or of a TOML file with what it leaves out.
+
+    Args:
+        path: of the file.
+        weld: joints that are fixed, so that they are of no leg.
 
     Raises:
         InputError: one line with the wrong part of the TOML file.
@@ -83,15 +94,20 @@ def propose_robot(path: Path) -> RobotProposal:
     file = description_of(path, {"name": "robot", "model": own.get("model", "")}).model
     wrong, error = [], None
     stem = "".join(x if x.isalnum() or x in "-_" else "-" for x in path.stem)
-    found = RobotProposal({"name": stem, **own}, (), [])
+    found = RobotProposal({"name": stem, **own}, ())
     try:
         with conversion(file):
             named = _named_legs(path, own)
             if not (named and "feet" in own and "standing" in own):
-                found = _with_legs(survey_file(file, named), found)
+                found = _with_legs(survey_file(file, named, (*weld, *_welded(own))), found)
                 found = _with_feet(found, wrong)
             names = {key: found.table[key] for key in _NAMES if key in found.table}
             description = description_of(path.with_suffix(".toml"), names)
+            if found.survey:
+                limits, lines = _limits(description, found.survey)
+                names["joints"] = _merged(limits, names["joints"])
+                found = found._replace(guesses=(*found.guesses, *lines))
+                description = description_of(description.path, names)
             if armature := _armature(description):
                 names["joints"] = _merged({"armature": armature}, names["joints"])
                 description = description_of(description.path, names)
@@ -115,7 +131,7 @@ def standard_form(proposal: RobotProposal, model: str) -> tuple[dict[str, Any], 
     """
     assert proposal.robot is not None
     description, table = proposal.robot.description, proposal.table
-    joints = {key: x for key, x in table["joints"].items() if key not in ("weld", "armature")}
+    joints = {key: x for key, x in table["joints"].items() if key not in _OF_FILE}
     feet = {
         leg: {"point": foot.point, "contacts": list(foot.contacts)}
         for leg, foot in zip(description.legs, description.named_feet, strict=True)
@@ -130,6 +146,13 @@ def _named_legs(path: Path, own: dict[str, Any]) -> list[tuple[str, ...]]:
     if isinstance(joints, dict) and not {*joints} & {*sum(FEET.values(), ())}:
         return []
     return list(from_table(f"{path}: joints", Joints, joints).legs.values())
+
+
+def _welded(own: dict[str, Any]) -> list[str]:
+    """Return the joints that a TOML file fixes."""
+    joints = own.get("joints", {})
+    welded = joints.get("weld", []) if isinstance(joints, dict) else []
+    return [x for x in welded if isinstance(x, str)] if isinstance(welded, list) else []
 
 
 def _with_legs(survey: Survey, found: RobotProposal) -> RobotProposal:
@@ -149,12 +172,8 @@ def _with_feet(found: RobotProposal, wrong: list[str]) -> RobotProposal:
     if len(soles[0].contacts) == 1:  # a round foot, whose contact moves when the leg bends
         soles = find_soles(survey, angles)
         angles, balanced = standing_pose(survey, soles, angles)
-    if soles[0].guessed and "feet" not in found.table:
-        wrong.append(
-            f"no box, sphere, capsule or cylinder of body {soles[0].section['body']!r} collides: "
-            "its contacts are guessed from its inertia: measure the sole and correct "
-            f"{' and '.join(f'feet.{leg}' for leg in FEET[len(soles)])}"
-        )
+    if "feet" not in found.table:
+        found = found._replace(guesses=(*found.guesses, *_sole_lines(soles)))
     if not balanced and "standing" not in found.table:
         wrong.append(
             "no standing pose found with level soles and the centre of mass over the feet: correct "
@@ -163,6 +182,22 @@ def _with_feet(found: RobotProposal, wrong: list[str]) -> RobotProposal:
     feet = dict(zip(FEET[len(soles)], (sole.section for sole in soles), strict=True))
     table = {"standing": angles, "joints": {}, "feet": feet} | found.table
     return found._replace(soles=soles, table=table)
+
+
+def _sole_lines(soles: Sequence[Sole]) -> Iterator[str]:
+    """Yield the line that says what a guessed sole is and how it is measured."""
+    if soles[0].guessed:
+        body, contacts = soles[0].section["body"], soles[0].contacts
+        count, (low, high) = len(contacts), (contacts.min(axis=0), contacts.max(axis=0))
+        length, width = (100.0 * (high - low)[:2]).tolist()
+        size = {1: "a point", 2: f"{length:.1f} cm long"}
+        feet = " and ".join(f"feet.{leg}" for leg in FEET[len(soles)])
+        yield (
+            f"the sole of body {body!r} is guessed from its inertia, {soles[0].guessed}: "
+            f"{size.get(count, f'{length:.1f} x {width:.1f} cm')}, {-100.0 * low[2]:.1f} cm below "
+            "its joint; measure heel, toe and height of the sole on the robot or in its drawing "
+            f"and correct the contacts of {feet}, which are in the body's frame [m]"
+        )
 
 
 def _merged(rules: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
@@ -228,6 +263,32 @@ def _settings(robot: Robot) -> dict[str, Any]:
             "payload": _short(mass),
         },
     }
+
+
+def _limits(description: Description, survey: Survey) -> tuple[dict[str, Any], list[str]]:
+    """Return ranges and torque limits of a leg's joints where the file has none; and lines."""
+    without_range, without_torque = without_limits(description)
+    joints: dict[str, Any] = {}
+    lines = []
+    if without_range:
+        joints["range"] = [[-_HALF_TURN, _HALF_TURN]] * description.leg_joints
+        lines.append(
+            f"joint {nor(without_range).format('range')}: half a turn to both sides is a guess; "
+            "write joints.range, or limits into the model"
+        )
+    if without_torque:
+        data = data_at(survey.model)
+        mass = float(survey.model.body_subtreemass[survey.trunk])
+        last = subtree(survey.model, int(survey.model.jnt_bodyid[survey.legs[0][-1]]))
+        length = float(data.xanchor[survey.legs[0][0]][2] - data.xipos[last][:, 2].min())
+        torque = _short(_TORQUE * mass * float(np.linalg.norm(survey.model.opt.gravity)) * length)
+        joints["torque"] = [torque] * description.leg_joints
+        lines.append(
+            f"joint {nor(without_torque).format('torque limit')}: {torque:g} N m, {_TORQUE} times "
+            "weight and length of a leg, is a guess; write joints.torque, or limits of motors "
+            "(effort in a URDF) into the model; a joint without a motor belongs into joints.weld"
+        )
+    return joints, lines
 
 
 def _armature(description: Description) -> list[float] | None:

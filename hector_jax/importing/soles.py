@@ -4,9 +4,11 @@ The contact points of a foot are those points of its primitive geoms that collid
 lie within 5 mm of the lowest one when all joints are zero. If the lowest box of a foot is tilted in
 this pose, its lower face is the sole; otherwise the sole is level. A sole wider than 2 cm at its
 front and at its back, under a leg of six joints or more, is flat with four corners. Any other sole
-longer than 2 cm is a line from heel to toe, and a shorter one a point. Both feet of a pair get the
-same lengths. Wrenches act in the middle of the contacts: under an ankle with a short heel the plan
-would have no room behind the foot point.
+longer than 2 cm is a line from heel to toe, unless the leg has three joints; the rest are points.
+Both feet of a pair get the same lengths. A foot without such a geom has the sole of its meshes, the
+facets of their hull that look down, or, if their files are not there, that of a box with its
+inertia, which is a guess. Wrenches act in the middle of the contacts: under an ankle with a short
+heel the plan would have no room behind the foot point.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,9 +17,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import ConvexHull, QhullError
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.trajectory import FEET
+from hector_jax.importing.meshes import foot_meshes
 from hector_jax.importing.survey import MIN_Y, Survey
 from hector_jax.robot.checks import expect
 from hector_jax.robot.description import FEWEST_JOINTS
@@ -29,6 +33,9 @@ _SAME_SOLE = 5e-3  # [m] above the lowest point
 _WIDE = 0.02  # [m]
 _TOLERANCE, _GUESS_TOLERANCE = 0.01, 0.03  # [m] between the feet of a pair
 _LEVEL, _UPRIGHT = np.cos(np.radians((0.5, 45.0)))  # range of tilts of a box that is a sole
+_ONE_PLANE = np.cos(np.radians(3.0))  # of the facets of a hull that are one sole
+_PLANE_SHARE = 0.4  # of all facets that look down, from which on a sole is a plane
+_TIP = 1e-3  # [m] above the lowest point of a round foot
 _FLAT_FROM = 6  # joints of a leg that can keep a flat sole level
 _DOWN = np.array([0.0, 0.0, -1.0])
 _RIM = 16  # points on a cylinder's edge
@@ -41,7 +48,8 @@ class Sole(NamedTuple):
     contacts: Float[np.ndarray, "c 3"]  # in the axes of the sole, from the last joint [m]
     under: Float[np.ndarray, "3"]  # point of the sole that stands under the centre of mass [m]
     axes: Float[np.ndarray, "3 3"]  # of the sole in the trunk frame, in the pose of `find_soles`
-    guessed: bool  # from the foot's inertia: the file has no geoms
+    guessed: str = ""  # why it is guessed from the foot's inertia; empty if it is not
+    files: tuple[str, ...] = ()  # of meshes that it was measured on
 
 
 def find_soles(survey: Survey, angles: Mapping[str, float] | None = None) -> tuple[Sole, ...]:
@@ -59,13 +67,25 @@ def find_soles(survey: Survey, angles: Mapping[str, float] | None = None) -> tup
     axes, origins = [_axes(data, leg) for leg in survey.legs], _origins(data, survey.legs)
     feet = list(zip(survey.legs, origins, axes, strict=True))
     points = [_floor_points(data, leg, origin, axis) for leg, origin, axis in feet]
-    guessed = not all(map(len, points))
-    if guessed:
-        points = [_inertia_box(data, leg) - origin for leg, origin, _ in feet]
+    guessed, files = "", ()
+    if not all(map(len, points)):
+        meshes = foot_meshes(survey, data)
+        if all(map(len, meshes.points)):
+            facets = [_lowest_facets(x, len(survey.legs[0])) for x in meshes.points]
+            axes = _mirrored_axes([axis for axis, _ in facets])
+            points = [(x - o) @ a for (_, x), o, a in zip(facets, origins, axes, strict=True)]
+            files = meshes.files
+        else:
+            guessed = "no shape of it collides, and " + (
+                f"its meshes are not there: {', '.join(meshes.missing)}"
+                if meshes.missing
+                else "it has no mesh"
+            )
+            points = [_inertia_box(data, leg) - origin for leg, origin, _ in feet]
     elif named := _named_soles(survey, data):
         return named
     outlines = [_outline(of_foot, len(survey.legs[0])) for of_foot in points]
-    tolerance, soles = _GUESS_TOLERANCE if guessed else _TOLERANCE, []
+    tolerance, soles = _GUESS_TOLERANCE if guessed or files else _TOLERANCE, []
     names = FEET[len(survey.legs)]
     for first in range(0, len(outlines), 2):
         left, right = outlines[first], _mirrored(outlines[first + 1])
@@ -77,7 +97,8 @@ def find_soles(survey: Survey, angles: Mapping[str, float] | None = None) -> tup
         for i, contacts in ((first, mean), (first + 1, _mirrored(mean))):
             joint = survey.legs[i][-1]
             from_joint = contacts + (origins[i] - data.xanchor[joint]) @ axes[i]
-            soles.append(_sole(data, survey.legs[i], from_joint, axes[i], guessed))
+            sole = _sole(data, survey.legs[i], from_joint, axes[i])
+            soles.append(sole._replace(guessed=guessed, files=files))
     return tuple(soles)
 
 
@@ -118,12 +139,53 @@ def _axes(data: mujoco.MjData, leg: Sequence[int]) -> Float[np.ndarray, "3 3"]:
         return np.eye(3)
     R = data.geom_xmat[min(boxes, key=lambda g: data.geom_xpos[g][2])].reshape(3, 3)
     face = int(np.argmax(np.abs(R[2])))
-    up = R[:, face] * np.sign(R[2, face])
+    return _axes_of(R[:, face] * np.sign(R[2, face]))
+
+
+def _axes_of(up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Return the axes of a sole, as columns, with a normal in the trunk frame."""
     if not _UPRIGHT < up[2] < _LEVEL:
         return np.eye(3)
     ahead = np.array([1.0, 0.0, 0.0]) - up[0] * up
     ahead /= np.linalg.norm(ahead)
     return np.column_stack([ahead, np.cross(up, ahead), up])
+
+
+def _lowest_facets(
+    points: Float[np.ndarray, "n 3"], joints: int
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "m 3"]]:
+    """Return the axes of the sole of a foot's meshes, and its points.
+
+    The last body of three joints is a shank, whose foot is round: its lowest points.
+    """
+    low = points[points[:, 2] <= points[:, 2].min() + _TIP]
+    if joints == FEWEST_JOINTS:
+        return np.eye(3), low
+    try:
+        hull = ConvexHull(points)
+    except QhullError:  # a plane
+        return np.eye(3), low
+    normals, facets = hull.equations[:, :3], points[hull.simplices]
+    looks_down = normals[:, 2] < -_UPRIGHT
+    if not looks_down.any():
+        return np.eye(3), low
+    normals, facets = normals[looks_down], facets[looks_down]
+    sides = facets[:, 1:] - facets[:, :1]
+    area = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    in_plane = normals @ normals.T > _ONE_PLANE
+    best = int(np.argmax(in_plane @ area))
+    share = float(in_plane[best] @ area / area.sum())
+    up = -(in_plane[best] * area) @ normals
+    axes = _axes_of(up / np.linalg.norm(up)) if share > _PLANE_SHARE else np.eye(3)
+    corners = facets.reshape(-1, 3)
+    heights = corners @ axes[:, 2]
+    return axes, corners[heights <= heights.min() + _SAME_SOLE]
+
+
+def _mirrored_axes(axes: Sequence[Float[np.ndarray, "3 3"]]) -> list[Float[np.ndarray, "3 3"]]:
+    """Return the axes of the soles with those of a right foot as the mirror image of the left."""
+    mirror = np.diag([1.0, -1.0, 1.0])
+    return [mirror @ axes[i - 1] @ mirror if i % 2 else one for i, one in enumerate(axes)]
 
 
 def _floor_points(
@@ -169,11 +231,13 @@ def _support(
 
 def _outline(points: Float[np.ndarray, "n 3"], joints: int) -> Float[np.ndarray, "c 3"]:
     """Return the corners front left, front right, back left, back right; toe, heel; or a point."""
+    if joints == FEWEST_JOINTS:  # they level no line
+        points = points[points[:, 2] <= points[:, 2].min() + _TIP]
     low, high = points.min(axis=0), points.max(axis=0)
     x, y, _ = 0.5 * (low + high)
     z = low[2]
     front, back = points[points[:, 0] >= x, 1], points[points[:, 0] <= x, 1]
-    if high[0] - low[0] <= _WIDE:
+    if high[0] - low[0] <= _WIDE or joints == FEWEST_JOINTS:
         return np.array([[x, y, z]])
     if min(np.ptp(front), np.ptp(back)) <= _WIDE or joints < _FLAT_FROM:
         return np.array([[high[0], y, z], [low[0], y, z]])
@@ -184,7 +248,8 @@ def _outline(points: Float[np.ndarray, "n 3"], joints: int) -> Float[np.ndarray,
 def _inertia_box(data: mujoco.MjData, leg: Sequence[int]) -> Float[np.ndarray, "n 3"]:
     """Return the lower corners of the box with the mass and inertia of the foot's last body.
 
-    The last body of three joints is a shank, whose foot is a point: the lower end of its box.
+    A tilted box is as large about the trunk's axes as its moments are. The last body of three
+    joints is a shank, whose foot is a point: the lower end of its box.
     """
     model, body = data.model, int(data.model.jnt_bodyid[leg[-1]])
     mass, moments = model.body_mass[body], model.body_inertia[body]
@@ -193,7 +258,7 @@ def _inertia_box(data: mujoco.MjData, leg: Sequence[int]) -> Float[np.ndarray, "
     if len(leg) == FEWEST_JOINTS:
         end = R[:, half.argmax()] * half.max()
         return (data.xipos[body] - end * np.sign(end[2]))[None]
-    return data.xipos[body] + list(product((-1, 1), (-1, 1), (-1.0,))) * (np.abs(R) @ half)
+    return data.xipos[body] + list(product((-1, 1), (-1, 1), (-1.0,))) * np.sqrt(R**2 @ half**2)
 
 
 def _sole(
@@ -201,7 +266,6 @@ def _sole(
     leg: Sequence[int],
     contacts: Float[np.ndarray, "c 3"],
     axes: Float[np.ndarray, "3 3"],
-    guessed: bool,
 ) -> Sole:
     """Return a sole by points in the frame of the body that the leg's last joint moves."""
     joint, pitch = leg[-1], [j for j in leg if abs(data.xaxis[j][1]) >= MIN_Y]
@@ -220,7 +284,7 @@ def _sole(
     ankle = (data.xanchor[pitch[-1]] - data.xanchor[joint]) @ axes[:, 0]
     if contacts[:, 0].min() < ankle - 1e-3 < ankle + 1e-3 < contacts[:, 0].max():
         under[0] = ankle  # whose motor then has least to bear
-    return Sole(section, contacts, under, axes, guessed)
+    return Sole(section, contacts, under, axes)
 
 
 def _named_soles(survey: Survey, data: mujoco.MjData) -> tuple[Sole, ...] | None:
@@ -243,5 +307,5 @@ def _named_soles(survey: Survey, data: mujoco.MjData) -> tuple[Sole, ...] | None
         if np.abs(contacts[:, 2] - point[2]).max() > 1e-3:
             return None
         names = {"point": site.name, "toe": model.geom(toe).name, "heel": model.geom(heel).name}
-        soles.append(Sole(names, contacts, point, np.eye(3), guessed=False))
+        soles.append(Sole(names, contacts, point, np.eye(3)))
     return tuple(soles)

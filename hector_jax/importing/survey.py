@@ -21,7 +21,7 @@ from jaxtyping import Float
 from hector_jax.core.headless import mujoco
 from hector_jax.robot.checks import expect, require
 from hector_jax.robot.description import FEWEST_JOINTS, MOST_JOINTS
-from hector_jax.robot.elements import spec_of
+from hector_jax.robot.elements import check_couplings, spec_of
 from hector_jax.robot.links import data_at, subtree
 from hector_jax.robot.mjcf import read_mjcf
 from hector_jax.robot.source import compile_bare
@@ -52,12 +52,15 @@ class Survey(NamedTuple):
     forwards: tuple[bool, ...]  # knees point ahead, for each pair of legs
 
 
-def survey_file(path: Path, named: Sequence[Sequence[str]] = ()) -> Survey:
+def survey_file(
+    path: Path, named: Sequence[Sequence[str]] = (), welded: Sequence[str] = ()
+) -> Survey:
     """Find the robot in a file by the rules of the module's docstring.
 
     Args:
         path: of the file.
         named: joints of each leg in the order of `FEET`, if they are known.
+        welded: joints that are fixed, and of no leg.
 
     Raises:
         InputError: one line with the missing part and the remedy.
@@ -69,10 +72,12 @@ def survey_file(path: Path, named: Sequence[Sequence[str]] = ()) -> Survey:
     names = ", ".join(model.joint(j).name for j in free)
     expect(path, len(free) < 2, f"free joints {names}, expected one at most, the trunk's")
     data = data_at(model)
-    for joint in sum(map(tuple, named), ()):
+    for joint in (*sum(map(tuple, named), ()), *welded):
         require(path, "joint", joint, [model.joint(j).name for j in range(model.njnt)])
     legs = tuple(tuple(model.joint(joint).id for joint in leg) for leg in named)
-    legs = legs or _legs(path, data, free)
+    legs = legs or _legs(path, data, [*free, *(model.joint(joint).id for joint in welded)])
+    joints = [model.joint(j).name for j in sum(legs, ())]
+    check_couplings(path, read_mjcf(path), joints, welded)
     trunk = int(model.jnt_bodyid[free[0]] if free else model.body_rootid[_body(model, legs[0][0])])
     others = [j for j in range(model.njnt) if j not in sum(legs, (*free,))]
     knee = _knee(path, data, legs[0])
@@ -127,23 +132,23 @@ def _body(model: mujoco.MjModel, joint: int) -> int:
     return int(model.jnt_bodyid[joint])
 
 
-def _chains(model: mujoco.MjModel, free: Sequence[int]) -> list[tuple[int, ...]]:
-    """Return the joints from the world down to each last joint."""
+def _chains(model: mujoco.MjModel, left_out: Sequence[int]) -> list[tuple[int, ...]]:
+    """Return the joints from the world down to each last joint, without those left out."""
     chains: dict[int, tuple[int, ...]] = {0: ()}  # by body
     inner: set[int] = set()
     for body in range(1, model.nbody):
         first = int(model.body_jntadr[body])
-        own = tuple(first + i for i in range(model.body_jntnum[body]) if first + i not in free)
+        own = tuple(first + i for i in range(model.body_jntnum[body]) if first + i not in left_out)
         chains[body] = chains[int(model.body_parentid[body])] + own
         if own:
             inner |= set(chains[body][:-1])
     return sorted({chain for chain in chains.values() if chain and chain[-1] not in inner})
 
 
-def _legs(path: Path, data: mujoco.MjData, free: Sequence[int]) -> tuple[tuple[int, ...], ...]:
+def _legs(path: Path, data: mujoco.MjData, left_out: Sequence[int]) -> tuple[tuple[int, ...], ...]:
     """Return the joints of the legs, pair by pair from the front, the left leg first."""
     model = data.model
-    chains, pairs, apart = _chains(model, free), [], []
+    chains, pairs, apart = _chains(model, left_out), [], []
     for first, second in combinations(chains, 2):
         common = sum(i == j for i, j in zip(first, second, strict=False))
         a, b = first[common:], second[common:]
@@ -160,6 +165,8 @@ def _legs(path: Path, data: mujoco.MjData, free: Sequence[int]) -> tuple[tuple[i
     ends = ", ".join(f"{model.joint(chain[-1]).name} ({len(chain)})" for chain in chains)
     text = f"no two legs found, expected two chains of {FEWEST_JOINTS} to {MOST_JOINTS} hinges "
     text += f"that mirror each other; chains by their last joint: {ends or 'none'}"
+    many = any(len(chain) > MOST_JOINTS for chain in chains)
+    text += "; joints that no motor turns can be fixed: hector robot --weld NAME" * many
     odd = np.flatnonzero((model.jnt_type != _HINGE) & (model.jnt_type != _FREE))
     text += f"; no hinges: {', '.join(model.joint(j).name for j in odd)}" * bool(len(odd))
     if apart:

@@ -16,7 +16,7 @@ from hector_jax.core.inputs import InputError, did_you_mean
 from hector_jax.core.trajectory import FEET
 from hector_jax.robot.description import Description
 
-_TOLERANCE = 1e-6  # [m]: between the contacts of different feet
+_TOLERANCE = 1e-4  # [m]: between the contacts of different feet; angles in files have few digits
 ON_FLOOR = 1e-3  # [m]: largest distance of a sole from the floor
 _OVER_FEET = 5e-3  # [m]: of the centre of mass outside the contacts; a point spans no length
 

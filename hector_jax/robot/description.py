@@ -8,6 +8,7 @@
     linkage = [5, 4]                   # the fifth joint's motor also turns the fourth; optional
     weld = ["waist"]                   # hinges that are fixed in the standing pose
     armature = one number per joint    # [kg m^2] of a leg's motors, which a URDF cannot state
+    range, torque = [lower, upper] and a number per joint  # [rad], [N m] where the model has none
     [feet]                             # per leg: names in the model, or points in a body's frame
     left, right = { point = site on the sole, toe = geom, heel = geom }
     left, right = { point = site, contacts = [geom, ...] }                   # 1, 2 or 4 contacts
@@ -116,6 +117,8 @@ class Description:
     linkage: tuple[int, int] | None = (5, 4)  # motor, and joint it also turns; counted from 1
     weld: tuple[str, ...] = ()  # joints
     armature: tuple[float, ...] = ()  # [kg m^2] of the joints of a leg; empty: the model's
+    range: tuple[tuple[float, float], ...] = ()  # [rad] of those of a leg without one in the model
+    torque: tuple[float, ...] = ()  # [N m] limits of those of a leg without one in the model
     feet: tuple[Foot, ...] = tuple(
         Foot(f"{side}_foot_point", (f"{side}_toe", f"{side}_heel")) for side in FEET[2]
     )
@@ -190,6 +193,8 @@ class Joints:
     linkage: tuple[int, int] | None = None
     weld: tuple[str, ...] = ()
     armature: Annotated[tuple[float, ...], NOT_NEGATIVE] = ()
+    range: tuple[tuple[float, float], ...] = ()
+    torque: Annotated[tuple[float, ...], POSITIVE] = ()
 
     @property
     def legs(self) -> dict[str, tuple[str, ...]]:
@@ -202,26 +207,23 @@ class Joints:
         count = counts[0]
         if not FEWEST_JOINTS <= count <= MOST_JOINTS or set(counts) != {count}:
             *first, last = map(str, counts)
-            raise InputError(
-                f"{' and '.join(self.legs)} must be {FEWEST_JOINTS} to {MOST_JOINTS} names each "
-                f"and as many in {'both' if len(counts) == 2 else 'all'}, got {', '.join(first)} "
-                f"and {last}"
-            )
+            text = f"{' and '.join(self.legs)} must be {FEWEST_JOINTS} to {MOST_JOINTS} names each "
+            text += f"and as many in {'both' if len(counts) == 2 else 'all'}, got "
+            raise InputError(f"{text}{', '.join(first)} and {last}")
         if len(set(names)) < len(names):
             duplicate = next(name for name in names if names.count(name) > 1)
             raise InputError(f"must be different names, got {short_repr(duplicate)} twice")
-        if len(self.armature) not in (0, count):
-            raise InputError(
-                f"armature must be a number for each of the {count} joints of a leg, "
-                f"got {short_repr(self.armature)}"
-            )
+        for name in ("armature", "range", "torque"):
+            if len(value := getattr(self, name)) not in (0, count):
+                text = f"{name} must be {'a pair' if name == 'range' else 'a number'} for each of "
+                raise InputError(f"{text}the {count} joints of a leg, got {short_repr(value)}")
+        if any(not low < high for low, high in self.range):
+            raise InputError(f"range must rise, got {short_repr(self.range)}")
         if self.linkage and (
             not all(1 <= i <= count for i in self.linkage) or len(set(self.linkage)) < 2
         ):
-            raise InputError(
-                f"linkage must be two joints of a leg, counted from 1 to {count}, "
-                f"got {list(self.linkage)}"
-            )
+            text = f"linkage must be two joints of a leg, counted from 1 to {count}"
+            raise InputError(f"{text}, got {list(self.linkage)}")
 
 
 @dataclass(frozen=True)
@@ -362,10 +364,8 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
     file = from_table(str(path), _File, table)
     name = path.stem if file.name is None else file.name
     if not name.replace("-", "").replace("_", "").isalnum():
-        raise InputError(
-            f"{path}: name must be letters, digits, - and _ (it names a folder), "
-            f"got {short_repr(name)}"
-        )
+        text = "name must be letters, digits, - and _ (it names a folder)"
+        raise InputError(f"{path}: {text}, got {short_repr(name)}")
     sections = {name: getattr(file, name) for name in CONTROL}
     return Description(
         model=path.parent / file.model,
@@ -376,6 +376,8 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
         linkage=file.joints.linkage,
         weld=file.joints.weld,
         armature=file.joints.armature,
+        range=file.joints.range,
+        torque=file.joints.torque,
         feet=tuple(file.feet.feet.values()) if file.feet else Description.feet,
         **vars(file.limits),
         control=_as_tuples({name: x for name, x in sections.items() if x is not None}),

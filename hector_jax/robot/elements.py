@@ -5,6 +5,7 @@ never opened. A body whose mass comes from a mesh, and a coupling of leg joints,
 
 CAD programs export frames of no mass, whose inertia is rounding: a body of at most MASSLESS has
 none, and a heavier one that is fixed to its parent is a point mass if no body can have its inertia.
+Of a light link that moves such moments are mended, and a note says so.
 
 Bodies and joints without a name get one, by which descriptions and messages mean them.
 """
@@ -14,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import short_repr
@@ -22,15 +24,27 @@ from hector_jax.robot.links import MASSLESS
 from hector_jax.robot.mjcf import mujoco_errors, text_of
 
 _GEOM = mujoco.mjtGeom
-_MESHES = (_GEOM.mjGEOM_MESH, _GEOM.mjGEOM_SDF, _GEOM.mjGEOM_HFIELD)
+MESHES = (_GEOM.mjGEOM_MESH, _GEOM.mjGEOM_SDF, _GEOM.mjGEOM_HFIELD)
 _NO_INERTIA = 1e-12  # [kg m^2], which MuJoCo accepts of any body
+_LIGHT, _LIGHTEST = 0.1, 0.02  # shares of the mass up to which moments are mended, see `_mended`
+_NONE = 1e-6  # [m^2] of moments of inertia by mass that are no more than rounding
+_DENSITY = 1000.0  # [kg/m^3] of the ball whose moments such a link gets
 _COUPLINGS = ("equality", "tendon")
 _UNUSED = (*_COUPLINGS, "sensor", "deformable", "custom")
+# settings that MuJoCo no longer has, by element; only with the value, if there is one
+_OF_OTHER_VERSIONS: dict[str, dict[str, str | None]] = {
+    "compiler": {"coordinate": "local", "convexhull": None},
+    "option": dict.fromkeys(("collision", "apirate", "mpr_iterations", "mpr_tolerance")),
+}
 _JOINT_PARTS = ("parent", "child", "origin", "axis", "limit", "dynamics")
 
 
 def spec_of(
-    path: Path, root: ElementTree.Element, joints: Sequence[str], keyframe: str | None
+    path: Path,
+    root: ElementTree.Element,
+    joints: Sequence[str],
+    keyframe: str | None,
+    weld: Sequence[str] = (),
 ) -> tuple[mujoco.MjSpec, list[str]]:
     """Return the spec of a file without unused parts, and one line per kind of removed part.
 
@@ -39,16 +53,28 @@ def spec_of(
         root: XML element of the file, changed in place.
         joints: names of the legs' joints.
         keyframe: name of the only keyframe to keep.
+        weld: joints that are fixed, and so what is coupled to them alone.
 
     Raises:
         InputError: one line naming a body that loses its mass, or a coupling of leg joints; or
             MuJoCo's error.
     """
+    check_couplings(path, root, joints, weld)
+    spec, notes, removed = parsed(path, root, joints, keyframe)
+    removed += _remove_meshes(path, spec)
+    notes += _mend_inertias(path, spec)
+    return spec, [*notes, *[f"{removed} meshes and pictures are not read"] * bool(removed)]
+
+
+def parsed(
+    path: Path, root: ElementTree.Element, joints: Sequence[str], keyframe: str | None
+) -> tuple[mujoco.MjSpec, list[str], int]:
+    """Return the spec of a file with the meshes of an MJCF, none opened; notes; meshes removed."""
     removed, notes = 0, []
     if root.tag == "robot":
         removed = _clean_urdf(path, root, joints)
     else:
-        _check_couplings(path, root, joints)
+        notes += _clean_options(root) + _add_trunk(root)
         for tag in _UNUSED:
             parts = root.findall(tag)
             if any(len(part) for part in parts):
@@ -73,9 +99,39 @@ def spec_of(
     with mujoco_errors(path, root):
         spec = mujoco.MjSpec.from_string(text_of(root))
     _add_names(spec)
-    removed += _remove_meshes(path, spec)
-    _mend_inertias(path, spec)
-    return spec, [*notes, *[f"{removed} meshes and pictures are not read"] * bool(removed)]
+    return spec, notes, removed
+
+
+def _clean_options(root: ElementTree.Element) -> list[str]:
+    """Remove flags, and settings of other versions of MuJoCo. Returns notes."""
+    gone = []
+    for option in root.findall("option"):
+        gone += ["<flag> of <option>"] * len(option.findall("flag"))
+        _remove(option, option.findall("flag"))
+    for tag, names in _OF_OTHER_VERSIONS.items():
+        for part in root.findall(tag):
+            for name in {*names} & {*part.attrib}:
+                if part.get(name) in (names[name], None) or names[name] is None:
+                    gone.append(f"{name} of <{tag}>")
+                    del part.attrib[name]
+    return [f"{listed(list(dict.fromkeys(gone)))} not used"] * bool(gone)
+
+
+def _add_trunk(root: ElementTree.Element) -> list[str]:
+    """Put legs that hang at the world, and all beside them, into a body. Returns a note."""
+    worlds = root.findall("worldbody")
+    bodies = [x for world in worlds for x in world.findall("body")]
+    hang = [x for x in bodies if any(j.get("type") != "free" for j in x.findall("joint"))]
+    free = root.find(".//freejoint") is not None or root.find(".//joint[@type='free']") is not None
+    if len(hang) < 2 or free:
+        return []
+    trunk = ElementTree.Element("body", name="trunk")
+    for world in worlds:
+        own = [x for x in world if x.tag in ("body", "geom")]
+        _remove(world, own)
+        trunk.extend(x for x in own if x.get("type") != "plane")  # a floor, as high as it likes
+    worlds[0].append(trunk)
+    return ["the legs hang at the world: what is there is the trunk"]
 
 
 def _remove(parent: ElementTree.Element, children: Sequence[ElementTree.Element]) -> None:
@@ -95,24 +151,43 @@ def _add_names(spec: mujoco.MjSpec) -> None:
             part.name = part.name or name
 
 
-def _mend_inertias(path: Path, spec: mujoco.MjSpec) -> None:
-    """Replace the inertias of bodies that have none, see the module's docstring."""
+def _mend_inertias(path: Path, spec: mujoco.MjSpec) -> list[str]:
+    """Replace the inertias of bodies that have none, see the module's docstring. Returns a note."""
+    total, mended = sum(body.mass for body in spec.bodies[1:] if body.explicitinertial), []
     for body in spec.bodies[1:]:
         xx, yy, zz, xy, xz, yz = [*body.inertia] + [0.0] * 3
         if np.isfinite(body.fullinertia[0]):
             xx, yy, zz, xy, xz, yz = body.fullinertia
-        least, middle, most = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        least, middle, most = moments
         fixed = not body.joints and body.parent.name != "world"
-        bad = least <= 0.0 or (fixed and least + middle < most)
-        if body.explicitinertial and (body.mass <= MASSLESS or bad):
+        impossible = least <= 0.0 or least + middle < most
+        if not body.explicitinertial or not (body.mass <= MASSLESS or impossible):
+            continue
+        value: float | None = _NO_INERTIA
+        if body.mass > MASSLESS and not fixed:
+            value = _mended(moments, body.mass, body.mass / total)
             text = f"body {body.name!r} has moments of inertia from {least:.3g} to {most:.3g}"
-            expect(path, body.mass <= MASSLESS or fixed, f"{text}, expected positive ones")
-            body.fullinertia, body.inertia = np.full(6, np.nan), np.full(3, _NO_INERTIA)
+            expect(path, value or least > 0.0, f"{text}, expected positive ones")
+            if value is None:  # MuJoCo says what to write, or the file has written it
+                continue
+            mended.append(body.name)
+        body.fullinertia, body.inertia = np.full(6, np.nan), np.full(3, value)
+    text = "moments of inertia that no body has are the mean of the three, or a ball's: "
+    return [text + listed(mended)] * bool(mended)
+
+
+def _mended(moments: Float[np.ndarray, "3"], mass: float, share: float) -> float | None:
+    """Return a moment of inertia in the place of impossible ones; None of a link that matters."""
+    if moments[2] <= _NONE * mass:
+        return 0.4 * mass * (0.75 * mass / (np.pi * _DENSITY)) ** (2 / 3)
+    light = share <= (_LIGHT if moments[0] > 0.0 else _LIGHTEST)
+    return float(moments.mean()) if light and moments.mean() > 0.0 else None
 
 
 def _remove_meshes(path: Path, spec: mujoco.MjSpec) -> int:
     """Remove meshes and pictures and the geoms made of them. Returns the number of parts."""
-    meshes = [geom for geom in spec.geoms if geom.type in _MESHES or geom.meshname]
+    meshes = [geom for geom in spec.geoms if geom.type in MESHES or geom.meshname]
     for geom in meshes:
         body, of_world = geom.parent, geom.parent.name == "world"
         terrain = of_world and (geom.contype or geom.conaffinity)
@@ -139,13 +214,23 @@ def _has_mass(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> bool:
     return bool(enabled and low <= geom.group <= high and mass)
 
 
-def _check_couplings(path: Path, root: ElementTree.Element, joints: Sequence[str]) -> None:
-    """Refuse an equality or a tendon that refers to a part of a leg."""
-    leg_parts = set(joints)
+def check_couplings(
+    path: Path, root: ElementTree.Element, joints: Sequence[str], weld: Sequence[str]
+) -> None:
+    """Refuse an equality or a tendon that refers to a part of a leg, and to nothing welded.
+
+    Raises:
+        InputError: one line with the parts of the legs that it couples, and the remedy.
+    """
+    leg_parts, welded = set(joints), set(weld)
     for body in root.iter("body"):
-        if any(joint.get("name") in joints for joint in body.findall("joint")):
-            leg_parts |= {part.get("name", "") for part in body.iter() if part.tag != "default"}
-    for tag in _COUPLINGS:
+        own = {joint.get("name") for joint in body.findall("joint")}
+        parts = {part.get("name", "") for part in body.iter() if part.tag != "default"}
+        if own & {*joints}:
+            leg_parts |= parts
+        elif own and own <= {*weld}:
+            welded |= parts
+    for tag in _COUPLINGS if root.tag == "mujoco" else ():
         for coupling in root.findall(f"{tag}/*"):
             references = {
                 value
@@ -154,21 +239,33 @@ def _check_couplings(path: Path, root: ElementTree.Element, joints: Sequence[str
                 if name not in ("name", "class")
             }
             coupled = sorted(references & leg_parts)
+            open_ = references & welded or coupling.get("active") == "false"
             text = f"<{coupling.tag}> of <{tag}> couples {', '.join(coupled)}, expected legs of "
-            text += "free hinges: remove it, or weld a joint of it"
-            expect(path, not coupled or coupling.get("active") == "false", text)
+            text += "free hinges: remove it, or weld a joint of it (hector robot --weld NAME)"
+            expect(path, not coupled or open_, text)
 
 
 def _clean_urdf(path: Path, root: ElementTree.Element, joints: Sequence[str]) -> int:
     """Keep links of numbers and primitives, and free joints. Returns the number of meshes."""
     removed = 0
     _check_tree(path, root)
+    for joint in root.findall("joint[@type='floating']"):  # of a world: MuJoCo's trunk floats
+        parent = joint.find("parent")
+        assert parent is not None
+        above = root.findall(f"joint/child[@link='{parent.get('link')}']")
+        world = root.find(f"link[@name='{parent.get('link')}']")
+        alone = len(root.findall(f"joint/parent[@link='{parent.get('link')}']")) == 1
+        if world is not None and alone and not above and world.find("inertial") is None:
+            _remove(root, [joint, world])
     for joint in root.findall("joint"):
         name = joint.get("name")
         mimics = joint.find("mimic") is not None and name in joints
         expect(path, not mimics, f"joint {name!r} mimics another one, expected a free hinge")
         _remove(joint, [part for part in joint if part.tag not in _JOINT_PARTS])
     for link in root.findall("link"):
+        _remove(link, [x for x in link.findall("collision") if x.find("geometry") is None])
+        for part in link.findall("collision"):
+            part.attrib.pop("name", None)  # MuJoCo warns of each that comes twice
         meshes = [part for part in link if part.find(".//mesh") is not None]
         removed += len(meshes)
         _remove(link, meshes)

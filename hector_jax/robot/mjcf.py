@@ -1,10 +1,11 @@
 """Check a robot's file of any origin before MuJoCo opens it.
 
-A model is one self-contained MJCF or URDF file of at most 1 MB: meshes and pictures are named in it
-but never opened (`elements` removes them). Elements that read other files (includes) or expand
-(entities, replicated and composed bodies, huge textures and memories) and numbers that no robot has
-(NaN, negative masses, empty ranges, turns in degrees where radians are due) are refused; the
-message names file, element, attribute and value. What a URDF draws only (visuals) is left out.
+A model is an MJCF or URDF file of at most 1 MB, which may include files that are beside or below
+it. Meshes and pictures are named in it but never opened (`elements` removes them). Elements that
+read other files or expand (entities, replicated and composed bodies, huge textures and memories)
+and numbers that no robot has (NaN, negative masses, empty ranges, turns in degrees where radians
+are due) are refused; the message names file, element, attribute and value. What a URDF draws only
+(visuals) is left out.
 Other modules check which bodies and joints a robot has.
 """
 
@@ -27,7 +28,8 @@ _MOST_BODIES, _MOST_JOINTS = 2000, 200
 _URDF_PARTS = ("link", "joint", "mujoco")  # of a robot; others are for other programs
 _LINK_PARTS = ("inertial", "collision")
 _TURN = 6.3  # [rad], rounded up
-_REFUSED = ("include", "attach", "model", "replicate", "composite", "flexcomp", "plugin")
+_MOST_INCLUDES = 100  # files
+_REFUSED = ("attach", "model", "replicate", "composite", "flexcomp", "plugin")
 
 _COUNT = Range(-1, 1_000_000)  # -1: as many as needed
 _NOT_NEGATIVE = "mass density armature damping frictionloss friction margin size"
@@ -62,24 +64,20 @@ def read_mjcf(path: Path) -> ElementTree.Element:
     Raises:
         InputError: one line naming the file and the first error in it.
     """
-    text = read_text(path, "the robot description", MOST_BYTES)
-    if match := re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
-        raise InputError(f"{path}: {match[1].upper()} is not accepted, expected plain MJCF or URDF")
-    try:
-        root = ElementTree.fromstring(text)
-    except (ElementTree.ParseError, ValueError) as error:
-        raise InputError(f"{path}: malformed XML: {one_line(error)}") from None
+    root = _root(path)
     if root.tag not in ("mujoco", "robot"):
         raise InputError(f"{path}: root element is <{root.tag[:40]}>, expected <mujoco> or <robot>")
     if root.tag == "robot":
         root[:] = [part for part in root if part.tag in _URDF_PARTS]
         for link in root.findall("link"):
             link[:] = [part for part in link if part.tag in _LINK_PARTS]
+    else:
+        _include(path, root)
     in_rad = root.tag == "robot" or any(x.get("angle") == "radian" for x in root.iter("compiler"))
     bodies = joints = 0
     for element, label in _labelled(path, root):
         file = f" of {short_repr(element.get('file'))}" if "file" in element.attrib else ""
-        text = f"<{element.tag}>{file} is not accepted, expected one self-contained file"
+        text = f"<{element.tag}>{file} is not accepted, expected plain bodies"
         expect(path, element.tag not in _REFUSED, text)
         bodies += element.tag in ("body", "link")
         joints += element.tag in ("joint", "freejoint") and element.get("type") != "fixed"
@@ -91,6 +89,36 @@ def read_mjcf(path: Path) -> ElementTree.Element:
     text = f"{joints} joints that move, expected at most {_MOST_JOINTS}: fix those of no leg"
     expect(path, joints <= _MOST_JOINTS, text)
     return root
+
+
+def _root(path: Path) -> ElementTree.Element:
+    """Return the root element of a file."""
+    text = read_text(path, "the robot description", MOST_BYTES)
+    if match := re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
+        raise InputError(f"{path}: {match[1].upper()} is not accepted, expected plain MJCF or URDF")
+    try:
+        return ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise InputError(f"{path}: malformed XML: {one_line(error)}") from None
+
+
+def _include(path: Path, root: ElementTree.Element) -> None:
+    """Put the content of the files that an MJCF includes into it; they may be beside or below it.
+
+    As in MuJoCo, each file can be included once, and its name is relative to the model.
+    """
+    folder, seen = path.parent.resolve(), {path.resolve()}
+    while found := [(p, x) for p in root.iter() for x in p if x.tag == "include"]:
+        for parent, element in found:
+            name = element.get("file", "")
+            file = (folder / name).resolve()
+            text = f"<include> of {short_repr(name)} is not accepted, expected a file beside the "
+            text += "model, or below it, that is included once"
+            expect(path, file.is_relative_to(folder) and file.is_file() and file not in seen, text)
+            expect(path, len(seen) <= _MOST_INCLUDES, f"more than {_MOST_INCLUDES} includes")
+            seen.add(file)
+            i = list(parent).index(element)
+            parent[i : i + 1] = list(_root(file))
 
 
 @contextmanager

@@ -60,8 +60,11 @@ def build_spec(description: Description) -> Source:
     root = read_mjcf(path)
     urdf = root.tag == "robot"
     keyframe = description.standing if isinstance(description.standing, str) else None
-    spec, notes = spec_of(path, root, description.joints, keyframe)
+    spec, notes = spec_of(path, root, description.joints, keyframe, description.weld)
     file = _read(description, root, spec)
+    _set_numbers(file)
+    _check_joints(file)
+    _check_world(file)
     angles, trunk_quat = _standing(file, urdf)
     limits = _torque_limits(file)
     fixed = {j: angle for j, angle in angles.items() if j not in file.joints}
@@ -114,12 +117,49 @@ def _read(description: Description, root: ElementTree.Element, spec: mujoco.MjSp
     joints = [names.index(joint) for joint in description.joints]
     first_body = model.jnt_bodyid[joints[0]]
     trunk = int(model.jnt_bodyid[free[0]] if free else model.body_rootid[first_body])
+    return _File(description, spec, model, trunk, joints, free[0] if free else -1)
+
+
+def without_limits(description: Description) -> tuple[list[str], list[str]]:
+    """Return the legs' joints that have no range, and those that have no torque limit, in a file.
+
+    Raises:
+        InputError: as `build_spec`.
+    """
+    root = read_mjcf(description.model)
+    spec, _ = spec_of(description.model, root, description.joints, None, description.weld)
+    file = _read(description, root, spec)
+    stated = _stated_limits(file)
+    passive = [name for name, limits in stated.items() if not min(limits, default=0.0) > 0.0]
+    return _without_range(file), passive
+
+
+def _set_numbers(file: _File) -> None:
+    """Set the numbers of the joints that the description has and the model has not."""
+    description, model, legs = file.description, file.model, len(file.description.feet)
     if description.armature:
-        model.dof_armature[model.jnt_dofadr[joints]] = len(description.feet) * description.armature
-    file = _File(description, spec, model, trunk, joints, free[0] if free else -1)
-    _check_joints(file)
-    _check_world(file)
-    return file
+        model.dof_armature[model.jnt_dofadr[file.joints]] = legs * description.armature
+    if description.range:
+        without = _without_range(file)
+        for j, span in zip(file.joints, legs * description.range, strict=True):
+            if model.joint(j).name in without:
+                model.jnt_limited[j], model.jnt_range[j] = True, span
+
+
+def _without_range(file: _File) -> list[str]:
+    """Return the joints of the legs that turn without end, unless all are wheels."""
+    description, model = file.description, file.model
+    endless = [
+        model.joint(j).name
+        for j in file.joints
+        if not model.jnt_limited[j] or np.ptp(model.jnt_range[j]) > _ENDLESS
+    ]
+    last = description.joints[description.leg_joints - 1 :: description.leg_joints]
+    limited = [name for name in endless if model.jnt_limited[model.joint(name).id]]
+    text = f"joints {listed(endless)} turn without end, as wheels do, expected feet: fix them"
+    text += f"; or the ranges of {listed(limited)} have another unit: {UNITS}" * bool(limited)
+    expect(description.model, not endless or not set(endless) <= set(last), text)
+    return [name for name in endless if name not in limited]
 
 
 def _check_joints(file: _File) -> None:
@@ -133,18 +173,8 @@ def _check_joints(file: _File) -> None:
     ]
     text = f"joints {listed(extra)} are of no leg: add them to weld or remove them"
     expect(path, not extra, text)
-    endless = [
-        model.joint(j).name
-        for j in file.joints
-        if not model.jnt_limited[j] or np.ptp(model.jnt_range[j]) > _ENDLESS
-    ]
-    last = description.joints[description.leg_joints - 1 :: description.leg_joints]
-    limited = [name for name in endless if model.jnt_limited[model.joint(name).id]]
-    text = f"joints {listed(endless)} turn without end, as wheels do, expected feet: fix them"
-    text += f"; or the ranges of {listed(limited)} have another unit: {UNITS}" * bool(limited)
-    expect(path, not endless or not set(endless) <= set(last), text)
-    without = [name for name in endless if name not in limited]
-    text = f"joint {_nor(without)}, expected limits (in a URDF: revolute, lower and upper)"
+    without = _without_range(file)
+    text = f"joint {nor(without)}, expected limits (in a URDF: revolute, lower and upper)"
     expect(path, not without, text.format("range"))
     for j in file.joints:
         body, joint = int(model.jnt_bodyid[j]), f"joint {model.joint(j).name!r}"
@@ -207,6 +237,23 @@ def _torque_limits(file: _File) -> list[float]:
     Limits are stated for the forces of its actuators, for the control of a motor and for the joint
     itself (effort in a URDF).
     """
+    torques, description = _stated_limits(file), file.description
+    if description.torque:
+        for name, torque in zip(torques, len(description.feet) * description.torque, strict=True):
+            if not min(torques[name], default=0.0) > 0.0:
+                torques[name] = [torque]
+    passive = [name for name, limits in torques.items() if not min(limits, default=0.0) > 0.0]
+    text = f"joint {nor(passive)}, expected forcerange or ctrlrange of its motor, "
+    text += (
+        "actuatorfrcrange of the joint, or effort in a URDF; a joint that is to have no motor is "
+    )
+    text += "named in joints.weld and not among those of its leg"
+    expect(file.description.model, not passive, text.format("torque limit"))
+    return [float(min(limits)) for limits in torques.values()]
+
+
+def _stated_limits(file: _File) -> dict[str, list[float]]:
+    """Return all limits of each leg joint's torque that the file states [N m]."""
     model, torques = file.model, {}
     for joint, name in zip(file.joints, file.description.joints, strict=True):
         limited = model.jnt_actfrclimited[joint]
@@ -218,20 +265,13 @@ def _torque_limits(file: _File) -> list[float]:
                 torques[name].append(gear * np.abs(motor.forcerange).min())
             if _is_motor(motor) and _limited(motor.ctrllimited, motor.ctrlrange):
                 torques[name].append(gear * abs(motor.gainprm[0]) * np.abs(motor.ctrlrange).min())
-    passive = [name for name, limits in torques.items() if not min(limits, default=0.0) > 0.0]
-    text = f"joint {_nor(passive)}, expected forcerange or ctrlrange of its motor, "
-    text += (
-        "actuatorfrcrange of the joint, or effort in a URDF; a joint that is to have no motor is "
-    )
-    text += "named in joints.weld and not among those of its leg"
-    expect(file.description.model, not passive, text.format("torque limit"))
-    return [float(min(limits)) for limits in torques.values()]
+    return torques
 
 
-def _nor(names: Sequence[str]) -> str:
+def nor(names: Sequence[str]) -> str:
     """Return names, the first one with a gap for what it has not.
 
-    >>> _nor(["a", "b", "c"]).format("range")
+    >>> nor(["a", "b", "c"]).format("range")
     "'a' has no range, nor have b, c"
     """
     first, others = repr(next(iter(names), "")), ", ".join(names[1:])
@@ -276,6 +316,7 @@ def _changes(file: _File, limits: Sequence[float], links: Sequence[Link]) -> lis
         (f"torque motors {motors}", not _motors_match(file, limits)),
         ("floor added" if not floor else "floor replaced", bits != [(1, 0)]),
         ("armature of the joints set", description.armature),
+        ("ranges or torque limits of the joints set", description.range or description.torque),
         ("contacts placed on the soles", any(f.body is not None for f in description.feet)),
         ("contact bits, friction and shapes set", not _contacts_match(file, links)),
         ("standing pose by angles", not isinstance(description.standing, str)),
