@@ -17,6 +17,7 @@ DOORS = {"mujoco": ("core.headless", "sim.mjx_model"), "pydrake": ("sim.drake",)
 DOORS |= {"pinocchio": ("sim.pinocchio",), "coal": ("sim.pinocchio",)}
 DOORS |= {"viser": ("report.view",), "trimesh": ("report.view",), "flax": ("grfm.nets",)}
 DOORS |= {"optax": ("grfm.nets", "tuning.difftune", "tuning.step_rules")}
+DOORS |= {"rosbags": ("own.bag",)}
 DOORS |= {"jaxopt": ("qp.jaxopt_solver",)}
 DOORS |= {"matplotlib": ("report.plots",), "tyro": ("cli.parse",)}
 DOORS |= {"jinja2": ("report.report", "export.source", "export.template")}

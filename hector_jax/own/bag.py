@@ -52,7 +52,7 @@ class _Series(NamedTuple):
     """Numbers of the messages of a topic, in their order."""
 
     topic: str
-    time: Float[np.ndarray, " n"]  # [s]
+    time: Float[np.ndarray, " n"]  # [s] after the start of the bag
     values: Float[np.ndarray, "n m"]
 
     def at(self, times: np.ndarray) -> np.ndarray:
@@ -80,10 +80,10 @@ class _Bag(NamedTuple):
         for connection, recorded, data in self.reader.messages(connections=connections):
             message = self.reader.deserialize(data, connection.msgtype)
             stamp = getattr(getattr(message, "header", None), "stamp", None)
-            own = 0.0 if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
-            times.append(own or 1e-9 * recorded)
+            own = 0 if stamp is None else 1_000_000_000 * stamp.sec + stamp.nanosec
+            times.append(own or recorded)
             found.append(message)
-        time = np.array(times)
+        time = 1e-9 * (np.array(times) - self.reader.start_time)  # of 1e18 ns 1 ns would be lost
         if len(back := np.flatnonzero(np.diff(time) < 0.0)):
             text = f"the time goes back by {-np.diff(time)[back[0]]:.3g} s"
             raise InputError(f"{self.path}: {topic}: {text} at message {back[0] + 1}")

@@ -111,6 +111,10 @@ def find_conventions(
         plain = replace(plain, height=twin.height)
     log = _Log(read, replace(config, twin=plain), robot, weights, command)
     fit = as_is = Fit(twin, log.error(twin))
+    if not np.isfinite(as_is.error) and all(
+        again is None for again, _ in _readings(log, twin, [1.0])
+    ):
+        read(twin)  # which tells why
     exact = EXACT * float(robot.mass * np.linalg.norm(robot.gravity))
     # with R of 1/40 no reading stands out: then all are tried with all
     for stage in (
@@ -152,7 +156,7 @@ def _best(log: _Log, tried: Iterable[tuple[_Again | None, list[TwinConfig]]]) ->
     """Return the best fit of some twins, that come with what they plan."""
     read = [(again, twins) for again, twins in tried if again is not None]
     fits = [Fit(of, _mean(log.difference(again, of))) for again, twins in read for of in twins]
-    return min(fits, key=lambda fit: fit.error)
+    return min(fits, key=lambda fit: fit.error, default=Fit(TwinConfig(), np.inf))
 
 
 def _readings(
@@ -198,7 +202,8 @@ def _fitted(log: _Log, twin: TwinConfig) -> Iterator[tuple[_Again | None, list[T
         assert again is not None  # its reading is that of the start
         return log.difference(again, twin).ravel()
 
-    options: dict[str, Any] = {"loss": "soft_l1", "diff_step": 1e-4, "max_nfev": 8}
+    options: dict[str, Any] = {"loss": "soft_l1", "diff_step": 1e-4, "max_nfev": 30}
+    options["x_scale"] = [{"input_cost": 1.0, "mass": 0.1, "height": 0.03}[name] for name in names]
     found = changed(least_squares(residuals, np.zeros(len(names)), bounds=(-1.0, 1.0), **options).x)
     yield log.again(found), [found]
 
