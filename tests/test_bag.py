@@ -1,8 +1,5 @@
 """Bags as logs: a walk that is written as one, in both formats, is the walk."""
 
-from pathlib import Path
-
-import jax
 import numpy as np
 import pytest
 from model import ROBOT
@@ -97,11 +94,13 @@ def write(path, log, plugin=StoragePlugin.MCAP, *, without=(), stride=2, back=No
         of = {x: bag.add_connection(x, kind, typestore=STORE) for x, kind in BY_TOPIC.items()}
         for number, row in enumerate(rows):
             # the state of a row is that at its end, what is commanded held from its begin on
-            stamp = 10**18 + number * stride * 1_000_000
-            stamp -= 10**9 if back == number else 0
+            recorded = 10**18 + number * stride * 1_000_000
+            stamp = recorded - (10**9 if back == number else 0)
             for topic, message in messages(log, row, stamp):
                 if topic not in without:
-                    bag.write(of[topic], stamp, STORE.serialize_cdr(message, message.__msgtype__))
+                    bag.write(
+                        of[topic], recorded, STORE.serialize_cdr(message, message.__msgtype__)
+                    )
     return path
 
 
@@ -159,12 +158,12 @@ def test_logs_may_be_bags(bag, walked, mapping, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (('"/odom"', '"/odometry"'), "no topic '/odometry'"),
-        (('joints = "/joint_states"', 'joints = "/odom"'), "/odom: no joint 'left_hip_yaw'"),
+        (('"/odom"', '"/odometry"'), "unknown topic '/odometry'; did you mean '/odom'?"),
+        (('joints = "/joint_states"', 'joints = "/odom"'), "/odom: unknown joint 'left_hip_yaw'"),
         (("start = 0.3", 'names = ["a"]'), "names must be those of the 10 joints, got 1"),
         (
             ("start = 0.3", f"names = {['left_hop', *ROBOT.description.joints[1:]]}"),
-            "/joint_states: no joint 'left_hop'",
+            "/joint_states: unknown joint 'left_hop'; did you mean 'left_hip_yaw'",
         ),
         (("contacts:data", "contacts:date"), "no numbers in field 'date'; fields of /contacts:"),
         (('"/contacts:data"', '"/odom:child_frame_id"'), "no numbers in field 'child_frame_id'"),

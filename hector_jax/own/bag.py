@@ -61,7 +61,8 @@ class _Series(NamedTuple):
 
     def last(self, times: np.ndarray) -> np.ndarray:
         """Return the values of the last messages before some times."""
-        return self.values[np.maximum(np.searchsorted(self.time, times, side="right") - 1, 0)]
+        rows = np.searchsorted(self.time, times + 1e-6, side="right") - 1  # at a time is before it
+        return self.values[np.maximum(rows, 0)]
 
 
 class _Bag(NamedTuple):
