@@ -189,19 +189,20 @@ def draw_own(path: Path) -> None:
         _arrow(axes, (10.3, 2.75), (11.6, 2.75), color=blue, linewidth=2.6)
         axes.text(10.95, 2.1, words, fontsize=9.5, ha="center", color=blue)
         axes.text(0.1, 1.55, "the first ten minutes", weight="bold", fontsize=11)
+        words = "as they went for a controller in C++ on two busy cores"
+        axes.text(3.3, 1.55, words, fontsize=9.5)
         axes.plot([0.4, 11.8], [1.0, 1.0], color="#33383f", linewidth=1.6)
         steps = (
-            (0, "robot.toml,\nmine.json"),
-            (2, "walker:\nrequest to log"),
-            (4, "hector walk,\nlog check"),
-            (6, "log twin:\npaste its lines"),
-            (8, "planner: state\nto plan; log twin"),
-            (10, "hector tune"),
+            (0, "robot.toml, mine.json,\nthe walker"),
+            (2, "hector walk"),
+            (4, "log check"),
+            (5, "log twin"),
+            (9.5, "its lines to paste:\nparity to 0.5 N"),
         )
         for minute, text in steps:
-            x = 0.7 + 1.08 * minute
+            x = 1.0 + 1.03 * minute
             axes.plot(x, 1.0, "o", color=blue, markersize=7)
-            axes.text(x, 1.2, f"{minute}", fontsize=9.5, ha="center")
+            axes.text(x, 1.2, f"{minute:g}", fontsize=9.5, ha="center")
             axes.text(x, 0.75, text, fontsize=9.5, ha="center", va="top")
 
 
