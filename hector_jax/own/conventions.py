@@ -20,6 +20,7 @@ from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import Command
 from hector_jax.control.twin import TwinConfig
 from hector_jax.control.weights import Weights
+from hector_jax.core.console import say
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.own.parity import plans_again
@@ -105,7 +106,8 @@ def find_conventions(
         weights, command: with which the controller walked.
     """
     twin = config.twin
-    leg_order(robot, twin.legs), leg_order(robot, twin.joint_legs)  # are names of legs
+    for names in (twin.legs, twin.joint_legs):
+        leg_order(robot, names)  # of which no reading could tell that they are wrong
     plain = replace(twin, **{x.name: x.default for x in fields(twin) if x.name in (*LOG, *MODEL)})
     if twin.com is not None:  # whose height cannot be left out
         plain = replace(plain, height=twin.height)
@@ -116,6 +118,8 @@ def find_conventions(
     ):
         read(twin)  # which tells why
     exact = EXACT * float(robot.mass * np.linalg.norm(robot.gravity))
+    if fit.error > exact:
+        say("its plans are not those of the log: trying other conventions, a minute or some")
     # with R of 1/40 no reading stands out: then all are tried with all
     for stage in (
         lambda of: _readings(log, of, [of.input_cost]),
