@@ -29,7 +29,7 @@ $(STAMP): requirements.lock pyproject.toml
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check --no-deps --editable .
 	@touch $@
 
-engines: $(STAMP) ## install the other engines, Drake and Pinocchio, and dask for --cluster
+engines: $(STAMP) ## install the other engines, Drake and Pinocchio, dask for --cluster, rosbags for --mapping
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -r requirements-engines.lock
 
 tune: $(STAMP) ## tune and evaluate: make tune TRAJ=straight|c|s|all, TRAJ="c s", ROBOT=robot.toml
@@ -73,4 +73,4 @@ docs: $(STAMP) ## the site, into docs/_build; a warning is an error
 lock: $(STAMP) ## resolve pyproject.toml into requirements.lock and requirements-engines.lock
 	@$(BIN)/python -m pip install --quiet uv
 	@$(LOCK) --extra dev -o requirements.lock
-	@$(LOCK) --extra cluster --extra drake --extra pinocchio -c requirements.lock -o requirements-engines.lock
+	@$(LOCK) --extra bags --extra cluster --extra drake --extra pinocchio -c requirements.lock -o requirements-engines.lock

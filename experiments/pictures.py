@@ -1,6 +1,7 @@
 """The pictures of README and docs: `python experiments/pictures.py NAME ...`, by default all.
 
     method        how a tuning works, as a block diagram
+    own           a controller of one's own: what its user provides, and the first minutes
     film          the robot with plain and with tuned weights, side by side
     before-after  errors along one walk of the sets nominal, expert and best
     race          loss by the number of walks, against CMA-ES and Bayesian optimisation
@@ -156,6 +157,55 @@ def draw_method(path: Path) -> None:
         axes.text(4.6, 0.7, "trains, once", fontsize=9.5, ha="center", color=orange)
 
 
+def draw_own(path: Path) -> None:
+    """Draw what the user of a controller provides, what is done with it, and the first minutes."""
+    blue = SETS["best"]["color"]
+    with drawing(path, 9.6, 4.6, legend_columns=0) as figure:
+        axes = figure.subplots()
+        axes.set(xlim=(0, 12.2), ylim=(-0.1, 5.75), aspect="equal")
+        axes.axis("off")
+        for x, text, color in ((2.1, "you provide", "#33383f"), (8.5, "hector_jax does", blue)):
+            axes.text(x, 5.55, text, weight="bold", fontsize=12, ha="center", color=color)
+        rows = (
+            (4.85, "walker\nweights, command in; log out", "is it the weights?\nhector log check"),
+            (
+                3.8,
+                "planner, or [twin]\nstate, feet, weights in; plan out",
+                "conventions, parity\nhector log twin",
+            ),
+            (
+                2.75,
+                "robot.toml, mine.json\nmodel of the robot, your weights",
+                "walks and slopes\nhector tune --walker",
+            ),
+        )
+        for y, given, done in rows:
+            _box(axes, (2.1, y), (4.0, 0.85), given, facecolor="white")
+            _box(axes, (8.5, y), (3.6, 0.85), done, edgecolor=blue)
+            _arrow(axes, (4.1, y), (6.7, y))
+        axes.text(5.4, 5.05, "log.npz, a bag", fontsize=9.5, ha="center")
+        axes.text(5.4, 4.0, "plans", fontsize=9.5, ha="center")
+        words = "best.json, your format"
+        _arrow(axes, (10.3, 2.75), (11.6, 2.75), color=blue, linewidth=2.6)
+        axes.text(10.95, 2.1, words, fontsize=9.5, ha="center", color=blue)
+        axes.text(0.1, 1.55, "the first ten minutes", weight="bold", fontsize=11)
+        words = "as they went for a controller in C++ on two busy cores"
+        axes.text(3.3, 1.55, words, fontsize=9.5)
+        axes.plot([0.4, 11.8], [1.0, 1.0], color="#33383f", linewidth=1.6)
+        steps = (
+            (0, "robot.toml, mine.json,\nthe walker"),
+            (2, "hector walk"),
+            (4, "log check"),
+            (5, "log twin"),
+            (9.5, "its lines to paste:\nparity to 0.5 N"),
+        )
+        for minute, text in steps:
+            x = 1.0 + 1.03 * minute
+            axes.plot(x, 1.0, "o", color=blue, markersize=7)
+            axes.text(x, 1.2, f"{minute:g}", fontsize=9.5, ha="center")
+            axes.text(x, 0.75, text, fontsize=9.5, ha="center", va="top")
+
+
 # The walks
 
 
@@ -263,6 +313,7 @@ def draw_page(path: Path, run: Path) -> None:
 
 PICTURES: dict[str, tuple[Path, Callable[[Path], None] | None]] = {
     "method": (OUT / "method.svg", draw_method),
+    "own": (OUT / "own.svg", draw_own),
     "film": (ROOT / "docs" / "walk.webp", draw_film),
     "before-after": (OUT / "before-after.png", draw_before_after),
     "race": (OUT / "race.png", draw_race),

@@ -21,6 +21,7 @@ DOORS |= {
     "flax": ("grfm.nets",),
 }
 DOORS |= {"optax": ("grfm.nets", "tuning.difftune", "tuning.step_rules")}
+DOORS |= {"rosbags": ("own.bag",)}
 DOORS |= {"jaxopt": ("qp.jaxopt_solver",)}
 DOORS |= {"matplotlib": ("report.plots",), "tyro": ("cli.parse",)}
 DOORS |= {"jinja2": ("report.report", "export.source", "export.template")}

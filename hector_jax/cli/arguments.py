@@ -1,15 +1,17 @@
 """Shared parts of the commands: weights, robots, plants and trajectories of flags, and printing."""
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from hector_jax.cli.flags import (
+    ByMapping,
     ByPlanner,
     ByWalker,
     Check,
@@ -35,6 +37,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import to_table
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree_file import ROBOT_DIGITS, read_card, tree_hash
+from hector_jax.own.bag import read_bag, read_mapping
 from hector_jax.own.program import Program, program_of
 from hector_jax.own.walker import Walker, walker_engine
 from hector_jax.robot.description import Description
@@ -86,6 +89,40 @@ def planner_of(args: ByPlanner) -> Program | None:
         return None
     settings = args if isinstance(args, ByWalker) else ByWalker()
     return program_of(args.planner, settings.walker_limit, settings.walker_uses)
+
+
+@contextmanager
+def logs_of(
+    args: ByMapping, paths: Sequence[Path], robot: Robot, seconds: float, tick: float
+) -> Iterator[list[Path]]:
+    """Yield logs: those of a --mapping are bags, of which logs are made for as long.
+
+    Args:
+        args: with the mapping, if any.
+        paths: logs, or bags.
+        robot, seconds, tick: see `own.bag.read_bag`.
+
+    Raises:
+        InputError: see `own.bag.read_bag`; or a log is a folder.
+    """
+    if args.mapping is None:
+        if folder := next(filter(Path.is_dir, paths), None):
+            raise InputError(f"{folder}: a bag needs a --mapping, else a log is a file (.npz)")
+        yield list(paths)
+        return
+    mapping = read_mapping(args.mapping)
+    with TemporaryDirectory(prefix="hector-bag-") as folder:
+        logs = [Path(folder) / f"{number}-{path.name}.npz" for number, path in enumerate(paths)]
+        for path, log in zip(paths, logs, strict=True):
+            entries: dict[str, Any] = {**read_bag(path, mapping, robot, seconds, tick)}
+            np.savez(log, **entries)
+        try:
+            yield logs
+        except InputError as error:
+            text = str(error)
+            for path, log in zip(paths, logs, strict=True):
+                text = text.replace(str(log), str(path))
+            raise InputError(text) from None
 
 
 def require_walker(args: ByWalker, robot: Robot) -> None:

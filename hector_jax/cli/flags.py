@@ -20,7 +20,8 @@ class PathKind(Enum):
     """What a flag names; its existence is checked before the slow imports."""
 
     FILE = "a file"
-    LOG = "a file or NAME=FILE"
+    LOG = "a log or NAME=LOG"
+    BAG = "a file, or the folder of a bag"
     RUN = "the folder of a run of `hector tune`"
     FOLDER = "a folder"  # may not exist yet
     EXPORTABLE = "a run folder, best or a weights file"
@@ -140,6 +141,14 @@ class ByPlanner(Flags):
     planner: Annotated[Path | None, PathKind.FILE] = None
 
 
+@dataclass(frozen=True, kw_only=True)
+class ByMapping(Flags):
+    """A command whose logs may be bags."""
+
+    # TOML file of the topics of a ROS 2 bag, if the log is one (docs/howto/walks.md; extra: bags)
+    mapping: Annotated[Path | None, PathKind.FILE] = None
+
+
 @_command
 class Collect(ForRobot, Parallel):
     """Walk on the high-fidelity simulator and record the measured ground forces.
@@ -234,7 +243,7 @@ class Propose(ForRobot, ByPlanner, Printed):
 
 
 @_command
-class Add(Printed):
+class Add(ByMapping, Printed):
     """Take the logs of the walks with the weights that `hector propose` named.
 
     Example: hector log add runs/robot log.npz
@@ -293,13 +302,13 @@ class Walk(Configured, ForRobot, ByWalker, Printed):
 
 
 @_command
-class Check(ForRobot, Printed):
+class Check(ForRobot, ByMapping, Printed):
     """Say what in the log of a walk no weights can mend: mass, delay, joints, units and so on.
 
     Example: hector log check mine.npz --traj straight
     """
 
-    log: Annotated[Path, PathKind.FILE]  # of any controller (docs/howto/own.md)
+    log: Annotated[Path, PathKind.BAG]  # of any controller (docs/howto/own.md)
     traj: Trajectory = "straight"  # that was walked: a name or a TOML file
     seconds: Seconds = 4.0  # length of the walk [s]
 
@@ -315,13 +324,13 @@ class Twin(Check, ByPlanner):
 
 
 @_command
-class Foretell(ForRobot, ByPlanner, Printed):
+class Foretell(ForRobot, ByPlanner, ByMapping, Printed):
     """Foretell from logs of walks what other weights would bring on the robot that walked.
 
     Example: hector log foretell mine.npz --walked nominal --weights expert best
     """
 
-    logs: tuple[Annotated[Path, PathKind.FILE], ...]  # of one robot and one trajectory
+    logs: tuple[Annotated[Path, PathKind.BAG], ...]  # of one robot and one trajectory
     walked: Weights = "nominal"  # with which they were walked: a file, nominal, expert or best
     weights: tuple[Weights, ...] = ("best",)  # that are foretold
     traj: Trajectory = "straight"  # that was walked: a name or a TOML file

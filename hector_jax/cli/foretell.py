@@ -55,11 +55,13 @@ def run_foretell(args: Foretell) -> None:
     options: dict[str, Any] = {"call": planner and partial(call_planner, planner), "walked": walked}
     say("compiling (only the first time on a machine) and foretelling")
     logged, found = [], []
-    for path in args.logs:
-        walk, score = _read(path, config, robot, trajectory.command)
-        logged.append(quantities(score))
-        found.append(foretell(config, robot, trajectory.command, walk, sets, **options))
-    is_here = args.robot is None and all(map(_is_ours, args.logs))
+    tick = config.rollout.walk.gait.tick
+    with arguments.logs_of(args, args.logs, robot, seconds, tick) as paths:
+        for path in paths:
+            walk, score = _read(path, config, robot, trajectory.command)
+            logged.append(quantities(score))
+            found.append(foretell(config, robot, trajectory.command, walk, sets, **options))
+        is_here = args.robot is None and all(map(_is_ours, paths))
     group = HERE if is_here else ELSEWHERE
     result = {
         "walked": {"name": args.walked, **_mean(logged)},

@@ -336,7 +336,8 @@ def _check_source(label: str, value: Path | str, source: PathKind) -> None:
     existing = next(x for x in (path, *path.parents) if os.path.exists(x))
     valid, is_file = {
         PathKind.FILE: (True, True),
-        PathKind.LOG: (True, True),
+        PathKind.LOG: (True, not is_dir),
+        PathKind.BAG: (True, not is_dir),
         PathKind.RUN: (is_dir, False),
         PathKind.FOLDER: (os.path.isdir(existing), False),
         PathKind.EXPORTABLE: (True, not named and not is_dir),

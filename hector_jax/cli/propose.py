@@ -63,8 +63,11 @@ def run_add(args: Add) -> None:
         _undo(args, campaign)
         return
     texts = list(map(str, args.logs))
-    files = _files(texts, list(campaign.commands))
-    with locked(args.folder), workers(PROCESSES) as pool:
+    given = _files(texts, list(campaign.commands))
+    length = campaign.seconds, campaign.config.rollout.walk.gait.tick
+    bags = arguments.logs_of(args, [*given.values()], campaign.robot, *length)
+    with locked(args.folder), workers(PROCESSES) as pool, bags as paths:
+        files = dict(zip(given, paths, strict=True))
         number = added_logs.read_campaign(pool, campaign).number
         named = [name for name, _ in map(named_file, texts)]
         tracked = _check_logs(campaign, number, files, named)

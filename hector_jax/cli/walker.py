@@ -1,10 +1,10 @@
 """A controller of the user: what the logs of its walks show, its twin, a tuning on its walks."""
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -16,12 +16,14 @@ from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import Check, Tune, Twin
 from hector_jax.control.controller import walk_config
 from hector_jax.control.trajectories import NamedCommand
+from hector_jax.control.twin import TwinConfig
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.console import say
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
-from hector_jax.core.trajectory import FEET
+from hector_jax.core.trajectory import FEET, Trajectory
+from hector_jax.own.conventions import find_conventions, lines_of, settings_of
 from hector_jax.own.log_check import check_log, read_check, unasked
 from hector_jax.own.parity import COMPONENTS, Parity, compare_plans
 from hector_jax.own.planner import (
@@ -32,7 +34,7 @@ from hector_jax.own.planner import (
     distance_to_log,
     plan_inputs,
 )
-from hector_jax.own.program import program_of
+from hector_jax.own.program import Program, program_of
 from hector_jax.own.walk_file import read_walk
 from hector_jax.own.walk_log import at_ticks, log_of, trajectory_of
 from hector_jax.own.walker import write_log
@@ -56,7 +58,9 @@ def run_check(args: Check) -> None:
     robot = load_robot(args.robot)
     trajectory = arguments.load_trajectory(args.traj, robot)
     seconds, config = arguments.walk_seconds(args, trajectory), walk_config(robot)
-    log, end = read_check(args.log, robot, trajectory.command, seconds, config.gait.tick)
+    tick = config.gait.tick
+    with arguments.logs_of(args, [args.log], robot, seconds, tick) as (path,):
+        log, end = read_check(path, robot, trajectory.command, seconds, tick)
     lines = [*([end] if end else []), *check_log(log, config.plan_interval)]
     if note := unasked(log):
         say(note)
@@ -69,22 +73,56 @@ def run_twin(args: Twin) -> None:
     robot = load_robot(args.robot)
     config, trajectory = walk_config(robot), arguments.load_trajectory(args.traj, robot)
     seconds = arguments.walk_seconds(args, trajectory)
-    walk, end = read_walk(args.log, robot, seconds, config.gait.tick)
-    weights = arguments.weights_by_name(args.weights, robot)
-    calls = None
-    if planner := arguments.planner_of(args):
-        ticks = trajectory_of(at_ticks(log_of(walk), config.gait.tick))
-        inputs = plan_inputs(config, robot, weights, trajectory.command, ticks)
-        calls = compare_calls(partial(call_planner, planner), config, robot, inputs, ticks)
-        parity = calls.parity
-    else:
-        parity = compare_plans(config, robot, weights, trajectory.command, walk)
-    result = _parity_result(parity) | {"ended": end}
-    lines = [*([end] if end else []), *_parity_lines(result, robot, args.planner)]
-    if calls:
+    weights, tick = arguments.weights_by_name(args.weights, robot), config.gait.tick
+    inputs = config, robot, weights, trajectory.command
+    planner = arguments.planner_of(args)
+    with arguments.logs_of(args, [args.log], robot, seconds, tick) as (path,):
+        read = cache(lambda twin: read_walk(path, robot, seconds, tick, twin=twin))
+        found = _by_planner(planner, read, inputs) if planner else _by_twin(read, inputs)
+    result = _parity_result(found.parity)
+    result |= {"ended": found.ended, "conventions": found.conventions}
+    end = [found.ended] if found.ended else []
+    lines = [*end, *_parity_lines(result, robot, args.planner)]
+    if calls := found.calls:
         result["calls"] = {name: x for name, x in calls._asdict().items() if name != "parity"}
         lines += _call_lines(calls)
     print_result(args.json, result, lambda: print(*lines, sep="\n"))
+
+
+class _Compared(NamedTuple):
+    """What `hector log twin` finds."""
+
+    parity: Parity
+    ended: str  # how the walk ended
+    calls: CallCheck | None = None
+    conventions: Mapping[str, Any] = {}  # lines of [twin], if others than those of the file fit
+
+
+def _by_planner(
+    planner: Program, read: Callable[[TwinConfig], tuple[Trajectory, str]], inputs: tuple
+) -> _Compared:
+    """Compare a log with the plans of a program."""
+    config, robot, *_ = inputs
+    walk, end = read(config.twin)
+    ticks = trajectory_of(at_ticks(log_of(walk), config.gait.tick))
+    asked = plan_inputs(*inputs, ticks)
+    calls = compare_calls(partial(call_planner, planner), config, robot, asked, ticks)
+    return _Compared(calls.parity, end, calls)
+
+
+def _by_twin(read: Callable[[TwinConfig], tuple[Trajectory, str]], inputs: tuple) -> _Compared:
+    """Compare a log with the plans of a twin, and look for conventions by which they fit."""
+    config, robot, *_ = inputs
+    as_is, fit = find_conventions(lambda twin: read(twin)[0], *inputs)
+    readable = bool(np.isfinite(as_is.error))
+    walk, end = read(config.twin if readable else fit.twin)
+    parity = compare_plans(*inputs, walk)
+    if not (settings := settings_of(fit, as_is, robot)):
+        return _Compared(parity, end)
+    before = as_is.error if readable else None
+    return _Compared(
+        parity, end, conventions={"twin": settings, "error": fit.error, "as_is": before}
+    )
 
 
 def _call_lines(calls: CallCheck) -> Iterator[str]:
@@ -145,6 +183,12 @@ def _parity_lines(result: Mapping[str, Any], robot: Robot, planner: Path | None)
         yield f"in {share:.0f} % of the plans the log has other feet on the floor: see [gait]"
     if result["unsolved"]:
         yield f"{plural(result['unsolved'], 'plan')} of the twin not solved"
+    if found := result["conventions"]:
+        before = "" if found["as_is"] is None else f" instead of {found['as_is']:.2g}"
+        text = f"in the mean the largest difference is {found['error']:.2g}{before}"
+        yield f"{text} with these lines in the robot's file:"
+        yield "[twin]"
+        yield from lines_of(found["twin"])
 
 
 def tune_walker(folder: Path, args: Tune) -> None:

@@ -287,6 +287,7 @@ def plan(
     contact, swing_ticks = gait.contact(config.gait, tick), gait.swing_ticks(config.gait, tick)
     loaded = config.gait.tick * jnp.any(contact)
     disturbance = integrate_error(mpc.integral, disturbance, state, reference, loaded)
+    mpc = mpc._replace(weights=config.twin.weights(mpc.weights))
     problem = MpcProblem(config.twin.body(robot), mpc, state, horizon, disturbance)
     solve = partial(solve_mpc, config.mpc, problem, dt=config.mpc_step, max_contacts=max_contacts)
     held = last is not None and every > 1

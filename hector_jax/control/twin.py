@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 
 from hector_jax.control.footstep import Feet
 from hector_jax.control.reference import Anchor, Command, reference_at
+from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array, contract
 from hector_jax.core.geometry import rot_z, rotation_from_euler, wrap_angle
 from hector_jax.core.inputs import InputError, short_repr
@@ -152,10 +153,20 @@ class TwinConfig:
     inertia: tuple[float, ...] | None = None  # [kg m^2] about the trunk's x, y and z
     toe: float | None = None  # [m] ahead of the foot point; heel behind it
     heel: float | None = None
+    # times R: 2 or 0.5 where a cost has halves, the step [s] or 1 over it where it is by the second
+    input_cost: Annotated[float, POSITIVE] = 1.0
+    # conventions of its logs (`own.walk_file`), and of the plans that a program answers
+    legs: tuple[str, ...] = ()  # order of forces, moments and contacts; empty: that of the robot
+    joint_legs: tuple[str, ...] = ()  # order of the joints, likewise
+    wrenches: str = "on_robot"  # of the ground on the robot, or of the robot "on_ground"
+    wrench_frame: str = "world"  # their axes: also the "heading", or the "trunk"
+    angles: str = "rpy"  # order of `euler`; or "ypr"
 
     def __post_init__(self) -> None:
         positive = dict.fromkeys(("height", "mass", "inertia"), POSITIVE)
-        check(self, toe=NOT_NEGATIVE, heel=NOT_NEGATIVE, frame=("foot", "trunk"), **positive)
+        words = {"frame": ("foot", "trunk"), "wrenches": ("on_robot", "on_ground")}
+        words |= {"wrench_frame": ("world", "heading", "trunk"), "angles": ("rpy", "ypr")}
+        check(self, toe=NOT_NEGATIVE, heel=NOT_NEGATIVE, **positive, **words)
         for name in ("com", "inertia"):
             if (got := getattr(self, name)) is not None and len(got) != 3:
                 text = f"TwinConfig.{name} must be 3 numbers"
@@ -168,6 +179,12 @@ class TwinConfig:
         given = {name: getattr(self, name) for name in ("mass", "toe", "heel")}
         given["inertia"] = None if self.inertia is None else np.diag(self.inertia)
         return robot._replace(**{name: x for name, x in given.items() if x is not None})
+
+    def weights(self, weights: Weights) -> Weights:
+        """Return weights with R in the units of the twin's cost."""
+        if self.input_cost == 1.0:
+            return weights
+        return weights._replace(R=jax.tree.map(lambda x: self.input_cost * x, weights.R))
 
     def state(self, robot: Robot, state: State) -> State:
         """Return the state of the point that the MPC takes for the centre of mass."""

@@ -65,6 +65,36 @@ def compare_plans(
     Raises:
         InputError: the walk is shorter than two plans, or its joints never move.
     """
+    rows, (wrench, contact, residual) = plans_again(config, robot, weights, command, walk)
+    own = jax.tree.map(lambda x: x[rows - 1], walk.reference)
+    plan, foot = np.nonzero(contact)
+    command_at = jax.tree.map(lambda x: x[rows], walk.command)
+    logged, twin = (np.concatenate(x, axis=-1)[plan, foot] for x in (command_at, wrench))
+    by_log = None
+    if own.position.any():
+        again = plans_again(config, robot, weights, command, walk, by_log=True)[1]
+        from_own = np.concatenate(again[0], axis=-1)[plan, foot]
+        by_log = float(np.abs(logged - from_own).max())
+    stands = walk.contact[rows]
+    other = np.mean(np.any(stands != contact, axis=1)) if walk.contact.any() else 0.0
+    unsolved = int(np.sum(~(residual <= SOLVED)))
+    time = rows[plan] * float(walk.period)
+    return Parity(time, foot, logged, twin, len(rows), by_log, float(other), unsolved=unsolved)
+
+
+def plans_again(
+    config: WalkConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    walk: Trajectory,
+    *,
+    by_log: bool = False,
+) -> tuple[Int[np.ndarray, " n"], tuple[Wrench, np.ndarray, np.ndarray]]:
+    """Return the samples of the plans of a walk, and their wrenches, stance feet and residuals.
+
+    Args, Raises: see `compare_plans`; `by_log`: from the reference in the log on.
+    """
     check_legs(walk)
     per_tick = round(config.gait.tick / float(walk.period))
     every = per_tick * config.twin.plan_ticks
@@ -74,21 +104,8 @@ def compare_plans(
     state, joints, own = jax.tree.map(
         lambda x: x[rows - 1], (walk.state, walk.joints, walk.reference)
     )
-    begins = state, joints, rows // per_tick
-    solve = partial(_plans, config, robot, weights, command)
-    wrench, contact, residual = jax.tree.map(np.asarray, solve((walk.initial, None, *begins)))
-    plan, foot = np.nonzero(contact)
-    command_at = jax.tree.map(lambda x: x[rows], walk.command)
-    logged, twin = (np.concatenate(x, axis=-1)[plan, foot] for x in (command_at, wrench))
-    by_log = None
-    if own.position.any():
-        from_own = np.concatenate(solve((walk.initial, own, *begins))[0], axis=-1)[plan, foot]
-        by_log = float(np.abs(logged - from_own).max())
-    stands = walk.contact[rows]
-    other = np.mean(np.any(stands != contact, axis=1)) if walk.contact.any() else 0.0
-    unsolved = int(np.sum(~(residual <= SOLVED)))
-    time = rows[plan] * float(walk.period)
-    return Parity(time, foot, logged, twin, len(rows), by_log, float(other), unsolved=unsolved)
+    inputs = walk.initial, own if by_log else None, state, joints, rows // per_tick
+    return rows, jax.tree.map(np.asarray, _plans(config, robot, weights, command, inputs))
 
 
 @partial(jax.jit, static_argnums=0)

@@ -9,6 +9,7 @@ and `weights.Q.position` (N, 3); its plans are `force`, `moment` and `touchdown`
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,11 +22,13 @@ from jaxtyping import Bool, Float
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.parameters import Tunable, name_of, numbers_of, own_names
 from hector_jax.control.reference import Command
+from hector_jax.control.twin import TwinConfig
 from hector_jax.control.weights import Weights, direction_names
 from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree_file import named_leaves
+from hector_jax.own.conventions import EXACT, usual_costs
 from hector_jax.own.parity import Parity
 from hector_jax.own.program import Program, call_program
 from hector_jax.own.walk_file import read_entries
@@ -183,7 +186,44 @@ def _closest(
         words = turned, feet, "reversed" if sign < 0 else ""
         found[tuple(filter(None, words))] = float(np.abs(there - logged)[contact].max())
     closest = min(found, key=lambda words: found[words])
-    return (closest if found[closest] < _CLOSER * found[()] else ()), found[closest]
+    return closest, found[closest]
+
+
+def _convention(
+    call: CallPlans,
+    config: WalkConfig,
+    asked: PlanInputs,
+    rows: np.ndarray,
+    *,
+    logged: Float[np.ndarray, "N feet 6"],
+    called: Float[np.ndarray, "N feet 6"],
+    least: float,
+) -> tuple[tuple[str, ...], float]:
+    """Return the convention that explains most of the distance of plans to a log, and the rest.
+
+    Tried are those of `_closest`, angles in the other order and other units of R. Below `least` no
+    other one is sought.
+    """
+    state, stands = asked.state, np.asarray(asked.contact)[rows]
+    as_is = float(np.abs(called - logged)[stands].max(initial=0.0))
+    if as_is <= least:
+        return (), as_is
+    turned = asked._replace(state=state._replace(euler=state.euler[:, ::-1]))
+    tried = {"if it is asked with the angles yaw, pitch, roll": turned}
+    for factor in usual_costs(config.mpc_step)[1:]:
+        weights = replace(TwinConfig(), input_cost=factor).weights(asked.weights)
+        tried[f"if it is asked with {factor:g} times R"] = asked._replace(weights=weights)
+    euler = state.euler[rows]
+    words, distance = _closest(logged, called, euler, stands)
+    for text, other in tried.items():
+        if distance <= least:
+            break
+        plans = call_rows(call, other, rows)[..., :6]
+        if np.isfinite(plans).all():
+            more, left = _closest(logged, plans, euler, stands)
+            if left < _CLOSER * distance:
+                words, distance = (*more, text), left
+    return (words if distance < _CLOSER * as_is else ()), distance
 
 
 def compare_calls(
@@ -224,9 +264,8 @@ def compare_calls(
     weight = float(robot.mass * np.linalg.norm(robot.gravity))
     names = *direction_names(inputs.weights), *own_names(inputs.weights)
     asked = {*direction_names(inputs.weights), *map(name_of, numbers)}
-    stands = np.asarray(inputs.contact)[rows]
-    euler = inputs.state.euler[rows]
-    convention, distance = _closest(logged[rows], called[rows], euler, stands)
+    plans = {"logged": logged[rows], "called": called[rows], "least": EXACT * weight}
+    convention, distance = _convention(call, config, inputs, rows, **plans)
     unused = np.abs(by_weights).max(axis=(0, 1, 2)) == 0.0
     return CallCheck(
         parity,

@@ -2,7 +2,8 @@
 
 An .npz with entries named like those of a `Trajectory`, such as `state.euler` (T, 3). Needed are
 `initial`, `state`, `command` and `joints`; of the others `period` is 1 ms by default, `effect` the
-command, and all else zero: no fall, solved plans.
+command, and all else zero: no fall, solved plans. Logs of other conventions are read as the section
+[twin] of the robot's file tells (`control.twin`), but not those that this project has written.
 """
 
 from collections.abc import Iterable
@@ -14,9 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import Command, anchor_at, reference_at
+from hector_jax.control.twin import TwinConfig
+from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.inputs import InputError, one_line
-from hector_jax.core.trajectory import State, Trajectory, has_fallen, no_samples
+from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen, no_samples
 from hector_jax.core.tree_file import named_leaves
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
@@ -24,12 +28,19 @@ from hector_jax.robot.model import Robot
 _NEEDED = ("initial.", "state.", "command.", "joints")
 _LEANS = 0.05  # share of a walk with a large roll that is no fall
 UPRIGHT = 0.9  # share of the standing height above which no robot lies or falls
+YPR = '[twin] angles = "ypr"'
 FLAGS = ("contact", "fallen", "legs_touch")
 """Entries of zeros and ones."""
 
 
 def read_walk(
-    path: Path, robot: Robot, seconds: float, tick: float, *, commanded: bool = True
+    path: Path,
+    robot: Robot,
+    seconds: float,
+    tick: float,
+    *,
+    commanded: bool = True,
+    twin: TwinConfig | None = None,
 ) -> tuple[Trajectory, str]:
     """Read a walk. One that ends early, or whose state is no number from some time on, fell then.
 
@@ -39,6 +50,7 @@ def read_walk(
         seconds: expected length.
         tick: that of the gait [s], a whole number of periods.
         commanded: refuse a file without `command`, which is zero else.
+        twin: conventions of the log; None: those of the robot's file.
 
     Returns:
         The walk (numpy), with the reference of the file, if any; from its end on, samples repeat
@@ -49,7 +61,8 @@ def read_walk(
             of finite numbers; or its period is no part of a tick.
     """
     needed = _NEEDED if commanded else tuple(name for name in _NEEDED if name != "command.")
-    walk, valid, wanted = _entries(path, robot, seconds, tick, needed)
+    twin = walk_config(robot).twin if twin is None else twin
+    walk, valid, wanted = _entries(path, robot, seconds, tick, needed=needed, twin=twin)
     min_height, max_tilt = robot.description.limits
     tilt = np.abs(walk.state.euler[:valid, :2]).max(axis=1)
     tilt = np.where(walk.state.position[:valid, 2] >= min_height, tilt, 0.0)  # of an upright trunk
@@ -58,7 +71,9 @@ def read_walk(
     leans = np.mean(np.abs(walk.state.euler[:valid, 0]) > max_tilt)  # a fall passes it at the end
     if tall.all() and max(pitch, yaw) < max_tilt and leans > _LEANS:
         text = f"roll reaches {roll:.3g} at full height and yaw stays small"
-        raise InputError(f"{path}: {text}, expected roll, pitch, yaw: is it yaw, pitch, roll?")
+        raise InputError(
+            f"{path}: {text}, expected roll, pitch, yaw: is it yaw, pitch, roll ({YPR})?"
+        )
     if tilt.max(initial=0.0) > np.pi or (tilt[:1] > max_tilt).any():
         text = f"roll or pitch reaches {tilt.max():.3g} at full height"
         raise InputError(f"{path}: {text}, expected radians")
@@ -107,7 +122,13 @@ def check_legs(walk: Trajectory) -> None:
 
 
 def _entries(
-    path: Path, robot: Robot, seconds: float, tick: float, needed: tuple[str, ...]
+    path: Path,
+    robot: Robot,
+    seconds: float,
+    tick: float,
+    *,
+    needed: tuple[str, ...],
+    twin: TwinConfig,
 ) -> tuple[Trajectory, int, int]:
     """Return the entries of a file; see `read_walk`.
 
@@ -116,7 +137,8 @@ def _entries(
         of samples that were expected.
     """
     empty = no_samples(len(robot.joint_lower), len(robot.foot_point))
-    arrays = read_entries(path, named_leaves(empty))
+    arrays = read_entries(path, (*named_leaves(empty), "card"))
+    ours = arrays.pop("card", None) is not None
     asked = "" if "period" in arrays else "; is period missing?"
     arrays = {"period": np.array(TIME_STEP)} | arrays
     if not _divides(period := arrays["period"], tick):
@@ -130,6 +152,8 @@ def _entries(
         raise InputError(f"{path}: expected {expected}, got {count}{asked}")
     needed = _NEEDED if any(name.startswith("command.") for name in arrays) else needed
     walk = _checked(path, arrays, empty, count, needed)
+    if not ours:
+        walk = _converted(twin, robot, walk, measured="effect.force" in arrays)
     finite = np.all([np.isfinite(x).all(axis=1) for x in walk.state], axis=0)
     valid = count if finite.all() else int(np.argmin(finite))
     for name, x in named_leaves(walk).items():
@@ -164,6 +188,58 @@ def _checked(
             raise InputError(f"{path}: {name} must hold zeros and ones")
         found[name] = found[name].astype(bool if name in FLAGS else float)
     return jax.tree.unflatten(jax.tree.structure(empty), list(found.values()))
+
+
+def leg_order(robot: Robot, names: tuple[str, ...]) -> list[int]:
+    """Return where the legs of the robot are in an order of their names; empty: as they are.
+
+    Raises:
+        InputError: the names are not those of the robot's legs.
+    """
+    legs = robot.description.legs
+    if names and sorted(names) != sorted(legs):
+        text = f"[twin] legs and joint_legs must be {', '.join(legs)} in their order"
+        raise InputError(f"{robot.description.path}: {text}, got {', '.join(names)}")
+    return [names.index(leg) for leg in legs] if names else list(range(len(legs)))
+
+
+def to_world(twin: TwinConfig, euler: np.ndarray, wrench: Wrench) -> Wrench:
+    """Return wrenches (n, feet, 3) of the ground on the robot, world frame, by a twin's convention.
+
+    Args:
+        twin: what `wrenches` and their frame are.
+        euler: (n, 3) when they were planned [rad].
+        wrench: of a log, or by call.
+    """
+    sign = -1.0 if twin.wrenches == "on_ground" else 1.0
+    if twin.wrench_frame == "world":
+        return jax.tree.map(lambda x: sign * x, wrench)
+    angles = euler if twin.wrench_frame == "trunk" else euler * [0.0, 0.0, 1.0]
+    R = sign * np.asarray(jax.vmap(rotation_from_euler)(angles))
+    return jax.tree.map(lambda x: np.einsum("nij,nfj->nfi", R, x), wrench)
+
+
+def _converted(twin: TwinConfig, robot: Robot, walk: Trajectory, *, measured: bool) -> Trajectory:
+    """Return the walk of a log of other conventions; `measured`: it has an `effect` of its own."""
+    feet, legs = leg_order(robot, twin.legs), leg_order(robot, twin.joint_legs)
+    walk = walk._replace(
+        joints=walk.joints.reshape(len(walk.joints), len(legs), -1)[:, legs].reshape(
+            walk.joints.shape
+        ),
+        contact=walk.contact[:, feet],
+        **{
+            name: jax.tree.map(lambda x: x[:, feet], getattr(walk, name))
+            for name in ("command", "effect")
+        },
+    )
+    if twin.angles == "ypr":
+        initial, state, own = (
+            x._replace(euler=x.euler[..., ::-1]) for x in (walk.initial, walk.state, walk.reference)
+        )
+        walk = walk._replace(initial=initial, state=state, reference=own)
+    begins = np.concatenate([walk.initial.euler[None], walk.state.euler[:-1]])
+    command = to_world(twin, np.nan_to_num(begins), walk.command)
+    return walk._replace(command=command, effect=walk.effect if measured else command)
 
 
 @partial(jax.jit, static_argnums=0)
