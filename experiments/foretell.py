@@ -29,18 +29,22 @@ from hector_jax.control.parameters import TUNABLES, steps_between, weights_after
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import best
-from hector_jax.core.console import bar
+from hector_jax.core.console import bar, say
 from hector_jax.core.environment import code_hash
 from hector_jax.core.files import as_json, write_file
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
+from hector_jax.own.planner import call_planner
+from hector_jax.own.program import program_of
 from hector_jax.own.walk_log import at_ticks, log_of
+from hector_jax.own.walker import Walker, walker_engine
 from hector_jax.report.report import markdown_table
+from hector_jax.robot.description import Description
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.standin import FAMILIES
-from hector_jax.sim.world import named_world
+from hector_jax.sim.world import Imperfections, hfs_with_motors, named_world, noisy
 from hector_jax.store import tunings
 from hector_jax.verdict import metrics
 from hector_jax.verdict.foretell import (
@@ -53,6 +57,7 @@ from hector_jax.verdict.foretell import (
     quantities,
 )
 
+_OTHER_NOISE = 100_000  # from the seed of a walk to one with other noise on the same plant
 SPREAD = 0.4  # standard deviation of a random step, in log-weights
 
 
@@ -67,6 +72,9 @@ class Flags(lib.Flags):
     plants: int = 24
     first_plant: int = 9200
     sets: int = 4  # that each log foretells
+    logs: int = 1  # of each plant, each with a noise of its own, as the walks of the sets
+    walker: Path | None = None  # program that walks with a controller of its own, and
+    planner: Path | None = None  # that plans with it
     add: tuple[Path, ...] = ()  # foretell.json of earlier calls, whose pairs are taken in
     out: Path = Path("runs/foretell")
 
@@ -80,6 +88,8 @@ class Case(NamedTuple):
     traj: str
     world: str
     seed: int
+    walker: Path | None
+    planner: Path | None
 
 
 class Pair(NamedTuple):
@@ -93,9 +103,13 @@ class Pair(NamedTuple):
     far: float  # see `foretell.distance`
     foretold: dict[str, float]
     walked: dict[str, float]
+    unexplained: float = np.nan  # see `foretell.Foretold`
+    logs: Sequence[Sequence[float]] = ()  # of L, by each of several logs: foretold, walked
 
 
-def drawn_sets(robot: Robot, config: WalkConfig, seed: int, count: int) -> list[Weights]:
+def drawn_sets(
+    robot: Robot, config: WalkConfig, seed: int, count: int, *, gains: bool = True
+) -> list[Weights]:
     """Draw weight sets: nominal, expert, or random steps from nominal and of the integral gains.
 
     Half of HECTOR's go some way towards `best`, as a tuning does.
@@ -107,51 +121,69 @@ def drawn_sets(robot: Robot, config: WalkConfig, seed: int, count: int) -> list[
         steps, known = rng.normal(0.0, SPREAD, len(zero)), rng.random()
         if rng.random() < 0.5:
             steps = steps / 2.0 + rng.random() * way
-        gains = {
+        others = {
             name: TUNABLES[name].read(config.parameters(start))
             * float(np.exp(rng.normal(0.0, 0.5)))
             for name in GROUPS_OF_NUMBERS["integral"]
         }
-        drawn = weights_after(start._replace(others=gains), steps)
+        drawn = weights_after(start._replace(others=others if gains else {}), steps)
         published = nominal(robot) if known < 0.25 else expert(robot)
         sets.append(published if known < 0.375 else jax.tree.map(np.asarray, drawn))
     return sets
 
 
-def log_job(case: Case, count: int) -> list[Pair]:
-    """Walk a log and the sets that it foretells; those that fall make no pair."""
+def plant_of(case: Case, description: Description) -> Imperfections:
+    """Return the plant of a case; those of a tuning on walks, of any motors, are called `drawn`."""
+    if case.world == "drawn":
+        return hfs_with_motors(case.seed, 0.4, description)._replace(estimator=noisy())
+    family = metrics.family_of(case.world)
+    return FAMILIES.get(family or "", partial(named_world, case.world))(case.seed, description)
+
+
+def log_job(case: Case, logs: int, count: int) -> list[Pair]:
+    """Walk logs and the sets that they foretell; those that fall make no pair."""
     robot = load_robot(None if case.file == "-" else Path(case.file))
     config, command = tunings.tune_config(robot), named_command(case.traj)
-    draw = FAMILIES.get(metrics.family_of(case.world) or "", partial(named_world, case.world))
-    plant = draw(case.seed, robot.description)
-    engine = choose_engine(case.engine)
+    plant, controller = plant_of(case, robot.description), config.rollout.walk
+    program = case.walker and Walker(program_of(case.walker, 60.0))
+    engine = walker_engine(program) if program else choose_engine(case.engine)
+    call = case.planner and partial(call_planner, program_of(case.planner, 60.0))
 
-    def walk(weights: Weights) -> Any:
-        job = Job(weights, command, plant, 4.0, case.seed)
-        return jax.device_get(next(engine.walk(None, config.rollout.walk, robot, [job])))
+    def walk(weights: Weights, other: int = 0) -> Any:
+        job = Job(weights, command, plant, 4.0, case.seed + _OTHER_NOISE * other)
+        return jax.device_get(next(engine.walk(None, controller, robot, [job])))
 
-    walked, *sets = drawn_sets(robot, config.rollout.walk, case.seed, count + 1)
-    logged = walk(walked)
-    log = at_ticks(log_of(logged), config.rollout.walk.gait.tick)
+    walked, *sets = drawn_sets(robot, controller, case.seed, count + 1, gains=call is None)
     named = {str(i): weights for i, weights in enumerate(sets)}
-    if np.any(logged.fallen):
+    logged = [walk(walked, i if logs > 1 else 0) for i in range(1, logs + 1)]
+    if any(np.any(x.fallen) for x in logged):
         return []
+    options: dict[str, Any] = {"walked": walked, "call": call}
+    ticks = [at_ticks(log_of(x), controller.gait.tick) for x in logged]
     try:
-        found = foretell(config, robot, command, log, named, walked=walked)
-    except InputError:
+        found = [foretell(config, robot, command, log, named, **options) for log in ticks]
+    except InputError as error:
+        say(f"{case.robot}, {case.traj}, {case.seed}: {error}")
         return []
-    before, pairs = quantities(metrics.score(config.loss, logged)), []
-    foretold_before = quantities(found.walked)
+    before = [quantities(metrics.score(config.loss, x)) for x in logged]
+    labels, pairs = (case.robot, case.engine, case.traj, case.world, case.seed), []
     for name, weights in named.items():
         score = metrics.score(config.loss, walk(weights))
-        if not score.fallen and not found.scores[name].fallen:
-            after, said = quantities(score), quantities(found.scores[name])
-            ratios = [
-                {x: log_ratio(new[x], old[x]) for x in new}
-                for new, old in ((said, foretold_before), (after, before))
+        if not score.fallen and not any(one.scores[name].fallen for one in found):
+            after = quantities(score)
+            each = [
+                [
+                    {x: log_ratio(new[x], old[x]) for x in new}
+                    for new, old in (
+                        (quantities(one.scores[name]), quantities(one.walked)),
+                        (after, old),
+                    )
+                ]
+                for one, old in zip(found, before, strict=True)
             ]
-            labels = case.robot, case.engine, case.traj, case.world, case.seed
-            pairs.append(Pair(*labels, found.distances[name], *ratios))
+            far, unexplained = found[0].distances[name], max(one.unexplained for one in found)
+            of_L = [[ratios["L"] for ratios in two] for two in each]
+            pairs.append(Pair(*labels, far, *each[0], unexplained, of_L))
     return pairs
 
 
@@ -201,12 +233,12 @@ def main(flags: Flags) -> Path:
     robots = lib.named_files("robots", flags.robots).items()
     seeds = range(flags.first_plant, flags.first_plant + flags.plants)
     cases = [
-        Case(name, file, engine, traj, flags.world, seed)
+        Case(name, file, engine, traj, flags.world, seed, flags.walker, flags.planner)
         for (name, file), engine, traj, seed in product(robots, flags.engines, flags.traj, seeds)
     ]
     pairs = [Pair(**pair) for path in flags.add for pair in json.loads(path.read_text())["pairs"]]
     with workers(flags.processes) as pool, bar("logs and what they foretell") as report_progress:
-        running = [pool.submit(log_job, case, flags.sets) for case in cases]
+        running = [pool.submit(log_job, case, flags.logs, flags.sets) for case in cases]
         for done, job in enumerate(as_completed(running), 1):
             report_progress(done, len(cases), f"{len(pairs)} pairs")
             pairs += job.result()

@@ -28,14 +28,14 @@ from hector_jax.control.reference import Command, standing_anchor
 from hector_jax.control.weights import Weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import read_json
-from hector_jax.core.trajectory import SOLVED
+from hector_jax.core.trajectory import SOLVED, Trajectory
 from hector_jax.grfm import network
 from hector_jax.own.planner import called_plans, plan_inputs
 from hector_jax.own.walk_log import Log, trajectory_of
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.called import CallPlans
 from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
+from hector_jax.tuning.grounded import Grounding, fit_grounding, grounded_rollout
 from hector_jax.tuning.rollout import Scenario
 from hector_jax.verdict import metrics
 from hector_jax.verdict.metrics import Interval, Score
@@ -56,6 +56,7 @@ class Foretold(NamedTuple):
     margins: dict[str, tuple[float, float]]  # by set: largest tilt and lowest height, see `margin`
     walked: Score  # of the log, as the grounded rollout repeats it
     distances: dict[str, float]  # of the weights from those of the log, see `distance`
+    unexplained: float  # see `unexplained`
 
 
 def quantities(score: Score) -> dict[str, float]:
@@ -121,7 +122,23 @@ def foretell(
         scores[name] = metrics.score(config.loss, found)
         margins[name] = margin(limits, found.state.euler, found.state.position)
     away = {name: distance(walked, weights) for name, weights in sets.items()}
-    return Foretold(scores, margins, scores.pop(""), away)
+    return Foretold(scores, margins, scores.pop(""), away, unexplained(grounding, walk))
+
+
+def unexplained(grounding: Grounding, walk: Trajectory) -> float:
+    """Return which share of the accelerations of a walk the rigid body does not explain (RMS).
+
+    It is the larger one of the linear and the angular accelerations.
+    """
+    residuals = grounding.residuals.state
+    shares = [
+        np.sqrt(np.mean(np.square(residual)) / np.mean(np.square(np.diff(x, axis=0))))
+        for residual, x in (
+            (residuals.velocity, walk.state.velocity),
+            (residuals.ang_velocity, walk.state.ang_velocity),
+        )
+    ]
+    return float(max(shares))
 
 
 def _completed(controller: WalkConfig, sets: Mapping[str, Weights]) -> dict[str, Weights]:
