@@ -40,7 +40,7 @@ from hector_jax.own.walk_log import at_ticks, log_of
 from hector_jax.own.walker import Walker, walker_engine
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.description import Description
-from hector_jax.robot.model import Robot, load_robot
+from hector_jax.robot.model import Robot, describe, load_robot
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.standin import FAMILIES
@@ -116,7 +116,8 @@ def drawn_sets(
     """
     start, rng, sets = nominal(robot), np.random.default_rng(seed), []
     zero = np.asarray(steps_between(start, start))
-    way = zero if robot.description.nominal else np.asarray(steps_between(start, best()))
+    ours = robot.description == describe()
+    way = np.asarray(steps_between(start, best())) if ours else zero
     for _ in range(count):
         steps, known = rng.normal(0.0, SPREAD, len(zero)), rng.random()
         if rng.random() < 0.5:

@@ -2,34 +2,27 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from hector_jax.cli import arguments
 from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import Foretell
-from hector_jax.control.reference import Command
 from hector_jax.core.console import say
-from hector_jax.core.inputs import InputError
-from hector_jax.own.log_check import check_log, read_check
 from hector_jax.own.planner import call_planner
-from hector_jax.own.walk_file import read_walk, reference_of
-from hector_jax.own.walk_log import at_ticks, log_of
-from hector_jax.robot.model import Robot, load_robot
+from hector_jax.robot.model import load_robot
 from hector_jax.store import tunings
-from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.verdict import metrics
 from hector_jax.verdict.foretell import (
     COVERAGE,
-    ELSEWHERE,
     HERE,
     Foretold,
     forecast,
     foretell,
+    group_of,
     quantities,
+    read_logged,
 )
 from hector_jax.verdict.metrics import Interval
 
@@ -56,43 +49,16 @@ def run_foretell(args: Foretell) -> None:
     say("compiling (only the first time on a machine) and foretelling")
     logged, found = [], []
     for path in args.logs:
-        walk, score = _read(path, config, robot, trajectory.command)
+        walk, score = read_logged(path, config, robot, trajectory.command)
         logged.append(quantities(score))
         found.append(foretell(config, robot, trajectory.command, walk, sets, **options))
-    is_here = args.robot is None and all(map(_is_ours, args.logs))
-    group = HERE if is_here else ELSEWHERE
+    group = group_of(robot, args.logs, called=planner is not None)
     result = {
         "walked": {"name": args.walked, **_mean(logged)},
         "sets": {name: _set_result(found, name, group, _mean(logged)) for name in sets},
         "calibration": group,
     }
     print_result(args.json, result, lambda: print(*_lines(result, len(found)), sep="\n"))
-
-
-def _read(path: Path, config: TuneConfig, robot: Robot, command: Command) -> tuple[Any, Any]:
-    """Return a log at the plan interval and the score of its walk.
-
-    Raises:
-        InputError: it has faults that no weight can mend, so that it foretells nothing; or it fell.
-    """
-    controller = config.rollout.walk
-    tick, seconds = controller.gait.tick, config.rollout.ticks * controller.gait.tick
-    checked, _ = read_check(path, robot, command, seconds, tick)
-    if faults := check_log(checked, controller.plan_interval):
-        raise InputError(f"{path} foretells nothing: {faults[0]}")
-    walk, end = read_walk(path, robot, seconds, tick)
-    if end:
-        raise InputError(f"{path} foretells nothing: {end}")
-    reference = jax.tree.map(np.asarray, reference_of(tick, robot, command, walk))
-    score = metrics.score(config.loss, walk._replace(reference=reference))
-    return at_ticks(log_of(walk), tick), score
-
-
-def _is_ours(path: Path) -> bool:
-    """Tell whether `hector walk` wrote a log, in MuJoCo."""
-    with np.load(path, allow_pickle=False) as archive:
-        card = str(archive["card"]) if "card" in archive.files else ""
-    return '"engine": "c"' in card and '"kind": "trajectory"' in card
 
 
 def _mean(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:

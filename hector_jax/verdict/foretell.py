@@ -7,7 +7,7 @@ make the interval (split conformal prediction, Vovk et al. 2005): of plants that
 of the pairs it holds the given share, whatever the distribution. Falls are not foretold.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,9 +30,11 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import read_json
 from hector_jax.core.trajectory import SOLVED, Trajectory
 from hector_jax.grfm import network
+from hector_jax.own.log_check import check_log, read_check
 from hector_jax.own.planner import called_plans, plan_inputs
-from hector_jax.own.walk_log import Log, trajectory_of
-from hector_jax.robot.model import Robot
+from hector_jax.own.walk_file import read_walk, reference_of
+from hector_jax.own.walk_log import Log, at_ticks, log_of, trajectory_of
+from hector_jax.robot.model import Robot, describe
 from hector_jax.tuning.called import CallPlans
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.grounded import Grounding, fit_grounding, grounded_rollout
@@ -57,6 +59,51 @@ class Foretold(NamedTuple):
     walked: Score  # of the log, as the grounded rollout repeats it
     distances: dict[str, float]  # of the weights from those of the log, see `distance`
     unexplained: float  # see `unexplained`
+
+
+def read_logged(
+    path: Path, config: TuneConfig, robot: Robot, command: Command
+) -> tuple[Log, Score]:
+    """Return a log at the plan interval, and the score of its walk.
+
+    Args:
+        path: file of the log, see `walk_file`.
+        config: loss, controller, and a rollout as long as the log.
+        robot, command: that walked, and what was asked of it.
+
+    Raises:
+        InputError: it has faults that no weight can mend, so that it foretells nothing; or it fell.
+    """
+    controller = config.rollout.walk
+    tick, seconds = controller.gait.tick, config.rollout.ticks * controller.gait.tick
+    checked, _ = read_check(path, robot, command, seconds, tick)
+    if faults := check_log(checked, controller.plan_interval):
+        raise InputError(f"{path} foretells nothing: {faults[0]}")
+    walk, end = read_walk(path, robot, seconds, tick)
+    if end:
+        raise InputError(f"{path} foretells nothing: {end}")
+    reference = jax.tree.map(np.asarray, reference_of(tick, robot, command, walk))
+    score = metrics.score(config.loss, walk._replace(reference=reference))
+    return at_ticks(log_of(walk), tick), score
+
+
+def group_of(robot: Robot, paths: Iterable[Path], *, called: bool = False) -> str:
+    """Return the group of pairs that a forecast from some logs is one of.
+
+    Args:
+        robot: that walked.
+        paths: files of the logs.
+        called: whether the controller is one that is known by calling it.
+    """
+    ours = robot.description == describe() and not called
+    return HERE if ours and all(map(_is_of_mujoco, paths)) else ELSEWHERE
+
+
+def _is_of_mujoco(path: Path) -> bool:
+    """Tell whether `hector walk` wrote a log, in MuJoCo."""
+    with np.load(path, allow_pickle=False) as archive:
+        card = str(archive["card"]) if "card" in archive.files else ""
+    return '"engine": "c"' in card and '"kind": "trajectory"' in card
 
 
 def quantities(score: Score) -> dict[str, float]:

@@ -1,5 +1,5 @@
 """Tuning on walks, of a simulator or of a robot.
 
 `campaign` has the settings, `best_set` those of the set `best`; `walks` is the loop and its folder;
-`added_logs` takes the logs of walks made elsewhere.
+`added_logs` takes the logs of walks made elsewhere, `forecasts` what they foretell.
 """
