@@ -11,7 +11,7 @@ has. On plants of a verdict the report counts the intervals that hold what was w
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -57,6 +57,10 @@ from hector_jax.verdict.foretell import (
     quantities,
 )
 
+ROOT = Path(__file__).parents[1]
+PACKAGED = ROOT / "hector_jax" / "verdict" / "foretold.json"
+VERDICT = ROOT / "experiments" / "reports" / "verdict" / "verdict.json"
+_LIMIT = 600.0  # [s] of a call of a program of the user
 _OTHER_NOISE = 100_000  # from the seed of a walk to one with other noise on the same plant
 SPREAD = 0.4  # standard deviation of a random step, in log-weights
 
@@ -76,6 +80,7 @@ class Flags(lib.Flags):
     walker: Path | None = None  # program that walks with a controller of its own, and
     planner: Path | None = None  # that plans with it
     add: tuple[Path, ...] = ()  # foretell.json of earlier calls, whose pairs are taken in
+    extend: bool = False  # the pairs of the package, instead of replacing them
     out: Path = Path("runs/foretell")
 
 
@@ -146,9 +151,9 @@ def log_job(case: Case, logs: int, count: int) -> list[Pair]:
     robot = load_robot(None if case.file == "-" else Path(case.file))
     config, command = tunings.tune_config(robot), named_command(case.traj)
     plant, controller = plant_of(case, robot.description), config.rollout.walk
-    program = case.walker and Walker(program_of(case.walker, 60.0))
+    program = case.walker and Walker(program_of(case.walker, _LIMIT))
     engine = walker_engine(program) if program else choose_engine(case.engine)
-    call = case.planner and partial(call_planner, program_of(case.planner, 60.0))
+    call = case.planner and partial(call_planner, program_of(case.planner, _LIMIT))
 
     def walk(weights: Weights, other: int = 0) -> Any:
         job = Job(weights, command, plant, 4.0, case.seed + _OTHER_NOISE * other)
@@ -188,28 +193,68 @@ def log_job(case: Case, logs: int, count: int) -> list[Pair]:
     return pairs
 
 
-def calibration(pairs: Sequence[Pair]) -> dict[str, Any]:
-    """Return the pairs by group, as `verdict.foretell` reads them."""
-    groups = {
-        group: [p for p in pairs if is_here(p) == (group == HERE)] for group in (HERE, ELSEWHERE)
-    }
-    return {
-        "code": code_hash("verdict.foretell"),
-        "pairs": {
-            group: {
-                "farthest": max((p.far for p in found), default=0.0),
-                "pairs": {
-                    name: [
-                        [round(p.foretold[name], 4), round(p.walked[name], 4)]
-                        for p in found
-                        if np.isfinite(p.foretold[name] + p.walked[name])
-                    ]
-                    for name in (found[0].walked if found else ())
-                },
-            }
-            for group, found in groups.items()
-        },
-    }
+def calibration(pairs: Sequence[Pair], known: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the pairs by group, as `verdict.foretell` reads them.
+
+    Args:
+        pairs: new ones.
+        known: groups to which they are added.
+    """
+    groups: dict[str, Any] = {"carried": carried_pairs(json.loads(VERDICT.read_text())["columns"])}
+    for group in (HERE, ELSEWHERE):
+        found = [p for p in pairs if is_here(p) == (group == HERE)]
+        before = known.get(group, {"farthest": 0.0, "pairs": {}})
+        rows = {
+            name: [
+                *before["pairs"].get(name, []),
+                *(
+                    [round(p.foretold[name], 4), round(p.walked[name], 4)]
+                    for p in found
+                    if np.isfinite(p.foretold[name] + p.walked[name])
+                ),
+            ]
+            for name in (found[0].walked if found else before["pairs"])
+        }
+        largest = [before.get("largest", np.nan), *(p.unexplained for p in found)]
+        groups[group] = {
+            "farthest": max([before["farthest"], *(p.far for p in found)]),
+            "largest": round(float(np.nanmax(largest)), 3),
+            "pairs": rows,
+        }
+    return {"code": code_hash("verdict.foretell"), "pairs": groups}
+
+
+def carried_pairs(columns: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return pairs of changes of L: the median in MuJoCo, and each plant of another column.
+
+    `held` counts the walks that the interval of the pairs of all other columns holds.
+
+    Args:
+        columns: of verdict.json, the first one of HECTOR in MuJoCo.
+    """
+    first, *others = columns
+    by_column: list[list[list[float]]] = []
+    for column in others:
+        by_column.append([])
+        for (traj, sets), name in product(column["trajectories"].items(), ("expert", "best")):
+            walked = changes_of(sets, name)
+            here = changes_of(first["trajectories"][traj], name)[: len(walked)]
+            median = round(float(np.median(here)), 4)
+            by_column[-1] += [[median, round(float(x), 4)] for x in walked if np.isfinite(x)]
+    held = 0
+    for i, column in enumerate(by_column):
+        rest = [pair for other in by_column[:i] + by_column[i + 1 :] for pair in other]
+        for here, walked in column:
+            _, low, high = interval(here, rest)
+            held += bool(low <= walked <= high)
+    pairs = [pair for column in by_column for pair in column]
+    return {"held": [held, len(pairs)], "pairs": {"L": pairs}}
+
+
+def changes_of(sets: Mapping[str, Any], name: str) -> np.ndarray:
+    """Return the log ratios of L to that of nominal, by plant; of a column of verdict.json."""
+    ours, nominal_ones = (np.array(sets[x]["L"]["by_seed"][:16]) for x in (name, "nominal"))
+    return np.log(ours / nominal_ones)
 
 
 def _row(pairs: Sequence[Pair]) -> list[str]:
@@ -244,8 +289,9 @@ def main(flags: Flags) -> Path:
             report_progress(done, len(cases), f"{len(pairs)} pairs")
             pairs += job.result()
     pairs.sort(key=lambda p: (p.robot, p.engine, p.traj, p.seed, p.far))
+    known = json.loads(PACKAGED.read_text())["pairs"] if flags.extend else {}
     if metrics.family_of(flags.world) is None:
-        write_file(flags.out / "foretold.json", as_json(calibration(pairs)).encode())
+        write_file(flags.out / "foretold.json", as_json(calibration(pairs, known)).encode())
     labels = dict.fromkeys((p.robot, p.engine, p.traj) for p in pairs)
     each = {at: [p for p in pairs if (p.robot, p.engine, p.traj) == at] for at in labels}
     rows = [[*at, *_row(found)] for at, found in each.items()]

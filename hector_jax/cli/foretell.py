@@ -23,6 +23,7 @@ from hector_jax.verdict.foretell import (
     group_of,
     quantities,
     read_logged,
+    widening,
 )
 from hector_jax.verdict.metrics import Interval
 
@@ -57,6 +58,7 @@ def run_foretell(args: Foretell) -> None:
         "walked": {"name": args.walked, **_mean(logged)},
         "sets": {name: _set_result(found, name, group, _mean(logged)) for name in sets},
         "calibration": group,
+        "wider": max(widening(one, group) for one in found),
     }
     print_result(args.json, result, lambda: print(*_lines(result, len(found)), sep="\n"))
 
@@ -106,6 +108,9 @@ def _lines(result: Mapping[str, Any], logs: int) -> Iterator[str]:
         yield "  ".join([first.ljust(widths[0]), *cells])
     of = "HECTOR in this simulator" if result["calibration"] == HERE else "other robots and engines"
     yield f"in brackets {100 * COVERAGE:.0f} % intervals, by forecasts that were walked: {of}"
+    if (wider := result["wider"]) > 1.0:
+        text = f"{wider:.1f} times as wide as measured: the rigid body explains less of this walk"
+        yield f"they are {text} than of any that was measured"
     if logs > 1:
         yield f"means of {logs} logs"
     for name, row in result["sets"].items():
