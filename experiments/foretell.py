@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import jax
@@ -26,7 +27,7 @@ import numpy as np
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.parameters import GROUPS as GROUPS_OF_NUMBERS
 from hector_jax.control.parameters import TUNABLES, steps_between, weights_after
-from hector_jax.control.reference import named_command
+from hector_jax.control.reference import Command, named_command
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import best
 from hector_jax.core.console import bar, say
@@ -34,9 +35,10 @@ from hector_jax.core.environment import code_hash
 from hector_jax.core.files import as_json, write_file
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
+from hector_jax.core.tree_file import save_tree
 from hector_jax.own.planner import call_planner
 from hector_jax.own.program import program_of
-from hector_jax.own.walk_log import at_ticks, log_of
+from hector_jax.own.walk_log import Log
 from hector_jax.own.walker import Walker, walker_engine
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.description import Description
@@ -44,8 +46,9 @@ from hector_jax.robot.model import Robot, describe, load_robot
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.standin import FAMILIES
-from hector_jax.sim.world import Imperfections, hfs_with_motors, named_world, noisy
+from hector_jax.sim.world import MOTOR_DELAY, Imperfections, hfs_with_motors, named_world, noisy
 from hector_jax.store import tunings
+from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.verdict import metrics
 from hector_jax.verdict.foretell import (
     ELSEWHERE,
@@ -55,6 +58,7 @@ from hector_jax.verdict.foretell import (
     interval,
     log_ratio,
     quantities,
+    read_logged,
 )
 
 ROOT = Path(__file__).parents[1]
@@ -139,9 +143,18 @@ def drawn_sets(
 
 
 def plant_of(case: Case, description: Description) -> Imperfections:
-    """Return the plant of a case; those of a tuning on walks, of any motors, are called `drawn`."""
-    if case.world == "drawn":
-        return hfs_with_motors(case.seed, 0.4, description)._replace(estimator=noisy())
+    """Return the plant of a case.
+
+    Those of a tuning on walks, of any motors, are called `drawn`; `shifted` are these with two
+    standard deviations more mass and delay.
+    """
+    if case.world in ("drawn", "shifted"):
+        plant = hfs_with_motors(case.seed, 0.4, description)._replace(estimator=noisy())
+        if case.world == "drawn":
+            return plant
+        mass, delay = 0.08, MOTOR_DELAY[1] - MOTOR_DELAY[0]  # widths of uniform distributions
+        more = 2.0 / np.sqrt(12.0)
+        return plant._replace(mass=plant.mass + more * mass, delay=plant.delay + more * delay)
     family = metrics.family_of(case.world)
     return FAMILIES.get(family or "", partial(named_world, case.world))(case.seed, description)
 
@@ -162,17 +175,17 @@ def log_job(case: Case, logs: int, count: int) -> list[Pair]:
     walked, *sets = drawn_sets(robot, controller, case.seed, count + 1, gains=call is None)
     named = {str(i): weights for i, weights in enumerate(sets)}
     logged = [walk(walked, i if logs > 1 else 0) for i in range(1, logs + 1)]
-    if any(np.any(x.fallen) for x in logged):
-        return []
-    options: dict[str, Any] = {"walked": walked, "call": call}
-    ticks = [at_ticks(log_of(x), controller.gait.tick) for x in logged]
+    found, before = [], []
     try:
-        found = [foretell(config, robot, command, log, named, **options) for log in ticks]
-    except InputError as error:
+        for one in logged:
+            log, score = _as_read(one, config, robot, command)
+            before.append(quantities(score))
+            options: dict[str, Any] = {"walked": walked, "call": call}
+            found.append(foretell(config, robot, command, log, named, **options))
+    except InputError as error:  # as the command would refuse it
         say(f"{case.robot}, {case.traj}, {case.seed}: {error}")
         return []
-    before = [quantities(metrics.score(config.loss, x)) for x in logged]
-    labels, pairs = (case.robot, case.engine, case.traj, case.world, case.seed), []
+    pairs = []
     for name, weights in named.items():
         score = metrics.score(config.loss, walk(weights))
         if not score.fallen and not any(one.scores[name].fallen for one in found):
@@ -189,8 +202,20 @@ def log_job(case: Case, logs: int, count: int) -> list[Pair]:
             ]
             far, unexplained = found[0].distances[name], max(one.unexplained for one in found)
             of_L = [[ratios["L"] for ratios in two] for two in each]
-            pairs.append(Pair(*labels, far, *each[0], unexplained, of_L))
+            said, came = each[0]
+            labels = case.robot, case.engine, case.traj, case.world, case.seed, far
+            pairs.append(Pair(*labels, said, came, unexplained, of_L))
     return pairs
+
+
+def _as_read(
+    walk: Any, config: TuneConfig, robot: Robot, command: Command
+) -> tuple[Log, metrics.Score]:
+    """Return log and score of a walk as the command reads them from its file."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "log.npz"
+        save_tree(path, walk, kind="trajectory", robot=robot)
+        return read_logged(path, config, robot, command)
 
 
 def calibration(pairs: Sequence[Pair], known: Mapping[str, Any]) -> dict[str, Any]:
@@ -219,9 +244,30 @@ def calibration(pairs: Sequence[Pair], known: Mapping[str, Any]) -> dict[str, An
         groups[group] = {
             "farthest": max([before["farthest"], *(p.far for p in found)]),
             "largest": round(float(np.nanmax(largest)), 3),
+            "several": several(found, before["pairs"].get("L", [])) or before.get("several", {}),
             "pairs": rows,
         }
     return {"code": code_hash("verdict.foretell"), "pairs": groups}
+
+
+def several(pairs: Sequence[Pair], known: Sequence[Sequence[float]]) -> dict[str, tuple[int, int]]:
+    """Count the means of several logs' forecasts whose interval holds, by number of logs.
+
+    Args:
+        pairs: by one or more logs each.
+        known: (foretold, walked) log ratios, that intervals are by.
+
+    Returns:
+        Means that held and all of them.
+    """
+    counts = {}
+    for logs in range(2, 1 + max((len(pair.logs) for pair in pairs), default=0)):
+        cases = [pair.logs[:logs] for pair in pairs if len(pair.logs) >= logs]
+        ends = [np.mean([interval(said, known) for said, _ in case], axis=0) for case in cases]
+        came = [np.mean([walked for _, walked in case]) for case in cases]
+        held = sum(bool(x[1] <= y <= x[2]) for x, y in zip(ends, came, strict=True))
+        counts[str(logs)] = held, len(cases)
+    return counts
 
 
 def carried_pairs(columns: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -288,6 +334,7 @@ def main(flags: Flags) -> Path:
         for done, job in enumerate(as_completed(running), 1):
             report_progress(done, len(cases), f"{len(pairs)} pairs")
             pairs += job.result()
+    pairs = [pair for pair in pairs if pair.far]  # else it is the set of the log
     pairs.sort(key=lambda p: (p.robot, p.engine, p.traj, p.seed, p.far))
     known = json.loads(PACKAGED.read_text())["pairs"] if flags.extend else {}
     if metrics.family_of(flags.world) is None:

@@ -21,6 +21,7 @@ from hector_jax.verdict.foretell import (
     forecast,
     foretell,
     group_of,
+    held_by_means,
     quantities,
     read_logged,
     widening,
@@ -112,7 +113,9 @@ def _lines(result: Mapping[str, Any], logs: int) -> Iterator[str]:
         text = f"{wider:.1f} times as wide as measured: the rigid body explains less of this walk"
         yield f"they are {text} than of any that was measured"
     if logs > 1:
-        yield f"means of {logs} logs"
+        counted = held_by_means(result["calibration"], logs)
+        held = "held in {} of {} cases".format(*counted) if counted else "that was not measured"
+        yield f"means of {logs} logs, with intervals of one: {held}"
     for name, row in result["sets"].items():
         if row["falls"]:
             yield f"{name} falls in its foretold walk: the numbers of its row are no forecast"

@@ -230,6 +230,12 @@ def calibrated(group: str) -> dict[str, Sequence[Sequence[float]]]:
     return _calibration()["pairs"][group]["pairs"]
 
 
+def held_by_means(group: str, logs: int) -> tuple[int, int] | None:
+    """Return how many means of so many logs' forecasts held, and of how many; None: not counted."""
+    counted = _calibration()["pairs"][group].get("several", {}).get(str(logs))
+    return counted and tuple(counted)
+
+
 @cache
 def _calibration() -> dict[str, Any]:
     return read_json(_PAIRS, "the measured errors of forecasts")
