@@ -240,10 +240,10 @@ def calibration(pairs: Sequence[Pair], known: Mapping[str, Any]) -> dict[str, An
             ]
             for name in (found[0].walked if found else before["pairs"])
         }
-        largest = [before.get("largest", np.nan), *(p.unexplained for p in found)]
+        largest = [before.get("largest", 0.0), *(p.unexplained for p in found)]
         groups[group] = {
             "farthest": max([before["farthest"], *(p.far for p in found)]),
-            "largest": round(float(np.nanmax(largest)), 3),
+            "largest": round(max(largest), 3),
             "several": several(found, before["pairs"].get("L", [])) or before.get("several", {}),
             "pairs": rows,
         }
@@ -273,27 +273,26 @@ def several(pairs: Sequence[Pair], known: Sequence[Sequence[float]]) -> dict[str
 def carried_pairs(columns: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return pairs of changes of L: the median in MuJoCo, and each plant of another column.
 
-    `held` counts the walks that the interval of the pairs of all other columns holds.
+    `held` counts the walks that are held by the interval of the other set in all other columns.
 
     Args:
         columns: of verdict.json, the first one of HECTOR in MuJoCo.
     """
     first, *others = columns
-    by_column: list[list[list[float]]] = []
-    for column in others:
-        by_column.append([])
-        for (traj, sets), name in product(column["trajectories"].items(), ("expert", "best")):
+    parts: dict[tuple[str, int], list[list[float]]] = {}
+    for name, (i, column) in product(("expert", "best"), enumerate(others)):
+        parts[name, i] = []
+        for traj, sets in column["trajectories"].items():
             walked = changes_of(sets, name)
             here = changes_of(first["trajectories"][traj], name)[: len(walked)]
             median = round(float(np.median(here)), 4)
-            by_column[-1] += [[median, round(float(x), 4)] for x in walked if np.isfinite(x)]
+            parts[name, i] += [[median, round(float(x), 4)] for x in walked if np.isfinite(x)]
     held = 0
-    for i, column in enumerate(by_column):
-        rest = [pair for other in by_column[:i] + by_column[i + 1 :] for pair in other]
-        for here, walked in column:
-            _, low, high = interval(here, rest)
-            held += bool(low <= walked <= high)
-    pairs = [pair for column in by_column for pair in column]
+    for (name, i), part in parts.items():
+        rest = [x for (other, j), more in parts.items() if name != other and i != j for x in more]
+        ends = [(interval(here, rest), walked) for here, walked in part]
+        held += sum(bool(one.low <= walked <= one.high) for one, walked in ends)
+    pairs = [pair for part in parts.values() for pair in part]
     return {"held": [held, len(pairs)], "pairs": {"L": pairs}}
 
 

@@ -21,7 +21,7 @@ import jax
 import numpy as np
 import pytest
 from delay import AS_PROPOSED, BEFORE
-from pretend import python
+from pretend import pretend_verdict, python
 
 from hector_jax import load_robot, nominal, walk_config
 from hector_jax.cli import flags, parse
@@ -261,7 +261,7 @@ def words(text):  # a bar of a table is no word
 
 def test_pages_keep_their_budgets():
     count = {page: words(page.read_text()) for page in PAGES if page.stem != "commands"}
-    assert sum(count.values()) <= 16_000
+    assert sum(count.values()) <= 18_000
     assert {page.name: n for page, n in count.items() if n > 1200} == {}
     assert sum(n for page, n in count.items() if page.stem.startswith("decisions")) <= 2500
     for name, most in {"CHANGELOG.md": 900, "experiments/notes.md": 2500}.items():
@@ -579,6 +579,9 @@ def other_pages():
     ends = [(foretell.interval(x["foretold"]["L"], known), x["walked"]["L"]) for x in pairs]
     held = sum(low <= came <= high for (_, low, high), came in ends)
     text = f"{held} of {len(pairs)} held what came, of {0.9 * len(pairs):.0f} that should"
+    yield DOCS / "howto" / "walks.md", text
+    carried = foretell.carry(pretend_verdict(8), "with")
+    text = f"held {carried.held} of {carried.walks} walks of the other set"
     yield DOCS / "howto" / "walks.md", text
     notes, walks = ROOT / "experiments" / "notes.md", report("many-plants/walks.json")["L"]
     best_of_then, searched = (np.array([*walks[name].values()]) for name in ("best", "search"))

@@ -143,7 +143,7 @@ def test_what_carries_over_to_other_engines_and_masses_is_that_of_the_verdict():
     assert change.low < change.value < change.high
     line = elsewhere_line(carried)
     assert line.startswith("On a robot that is not this simulator expect ")
-    assert f"(90 %; held in {carried.held} of {carried.walks} walks in other engines" in line
+    assert f"(90 %; held in {carried.held} of {carried.walks} walks of other sets" in line
     less = Carried({"s": Interval(-70.0, -79.2, -63.4)}, 58, 64)
     assert "63 to 79 % less loss than with nominal on s (90 %; held in 58 of 64" in elsewhere_line(
         less

@@ -141,7 +141,7 @@ def elsewhere_line(carried: Carried) -> str:
     if not carried.change:
         return ""
     each = [f"{_less(low, high)} on {scene}" for scene, (_, low, high) in carried.change.items()]
-    held = f"held in {carried.held} of {carried.walks} walks in other engines and with other masses"
+    held = f"held in {carried.held} of {carried.walks} walks of other sets, engines and masses"
     return f"On a robot that is not this simulator expect {', '.join(each)} (90 %; {held})."
 
 

@@ -301,7 +301,7 @@ class Carried(NamedTuple):
     """What a change of L in this simulator tells of robots that are not this simulator."""
 
     change: dict[str, Interval]  # [%] by scene
-    held: int  # walks whose interval held, by the pairs of all other engines and masses
+    held: int  # walks whose interval held, by another set in all other engines and masses
     walks: int
 
 
