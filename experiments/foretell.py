@@ -244,30 +244,37 @@ def calibration(pairs: Sequence[Pair], known: Mapping[str, Any]) -> dict[str, An
         groups[group] = {
             "farthest": max([before["farthest"], *(p.far for p in found)]),
             "largest": round(max(largest), 3),
-            "several": several(found, before["pairs"].get("L", [])) or before.get("several", {}),
+            "several": several(found) or before.get("several", {}),
             "pairs": rows,
         }
     return {"code": code_hash("verdict.foretell"), "pairs": groups}
 
 
-def several(pairs: Sequence[Pair], known: Sequence[Sequence[float]]) -> dict[str, tuple[int, int]]:
-    """Count the means of several logs' forecasts whose interval holds, by number of logs.
+def several(pairs: Sequence[Pair]) -> dict[str, tuple[int, int]]:
+    """Count the means of several logs' forecasts that intervals hold, by number of logs.
+
+    The intervals are those of single logs of all other plants.
 
     Args:
         pairs: by one or more logs each.
-        known: (foretold, walked) log ratios, that intervals are by.
 
     Returns:
         Means that held and all of them.
     """
     counts = {}
-    for logs in range(2, 1 + max((len(pair.logs) for pair in pairs), default=0)):
-        cases = [pair.logs[:logs] for pair in pairs if len(pair.logs) >= logs]
-        ends = [np.mean([interval(said, known) for said, _ in case], axis=0) for case in cases]
-        came = [np.mean([walked for _, walked in case]) for case in cases]
-        held = sum(bool(x[1] <= y <= x[2]) for x, y in zip(ends, came, strict=True))
+    for logs in range(1, 1 + max((len(pair.logs) for pair in pairs), default=0)):
+        cases, held = [pair for pair in pairs if len(pair.logs) >= logs], 0
+        for case in cases:
+            known = [of_first_log(pair) for pair in pairs if pair.seed != case.seed]
+            ends = np.mean([interval(said, known) for said, _ in case.logs[:logs]], axis=0)
+            held += bool(ends[1] <= np.mean([came for _, came in case.logs[:logs]]) <= ends[2])
         counts[str(logs)] = held, len(cases)
     return counts
+
+
+def of_first_log(pair: Pair) -> tuple[float, float]:
+    """Return what a pair's first log foretold of L, and what was walked."""
+    return pair.foretold["L"], pair.walked["L"]
 
 
 def carried_pairs(columns: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -61,7 +61,7 @@ class Foretold(NamedTuple):
     margins: dict[str, tuple[float, float]]  # by set: largest tilt and lowest height, see `margin`
     walked: Score  # of the log, as the grounded rollout repeats it
     distances: dict[str, float]  # of the weights from those of the log, see `distance`
-    unexplained: float  # see `unexplained`
+    unexplained: float  # see `unexplained_acceleration`
 
 
 def read_logged(
@@ -173,11 +173,15 @@ def foretell(
         margins[name] = margin(limits, found.state.euler, found.state.position)
     away = {name: distance(walked, weights) for name, weights in sets.items()}
     return Foretold(
-        scores, margins, scores.pop(""), away, unexplained(controller.gait.tick, grounding)
+        scores,
+        margins,
+        scores.pop(""),
+        away,
+        unexplained_acceleration(controller.gait.tick, grounding),
     )
 
 
-def unexplained(tick: float, grounding: Grounding) -> float:
+def unexplained_acceleration(tick: float, grounding: Grounding) -> float:
     """Return the acceleration of a walk that the rigid body does not explain, by gravity (RMS).
 
     Args:
