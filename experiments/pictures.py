@@ -4,6 +4,7 @@
     own           a controller of one's own: what its user provides, and the first minutes
     film          the robot with plain and with tuned weights, side by side
     before-after  errors along one walk of the sets nominal, expert and best
+    foretold      loss walked by loss foretold, with intervals
     race          loss by the number of walks, against CMA-ES and Bayesian optimisation
     robots        four robots walking
     page          the browser page of a run (needs Chromium and a run: --run)
@@ -28,7 +29,7 @@ import tyro
 from matplotlib.axes import Axes
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from PIL import Image, ImageDraw, ImageFont
-from plots import draw_repeats
+from plots import draw_repeats, forecasts
 
 from hector_jax import (
     Job,
@@ -52,9 +53,11 @@ from hector_jax.report.video import VideoConfig, write_film, write_strip
 from hector_jax.robot.model import Robot
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections
+from hector_jax.verdict.foretell import HERE, calibrated
 
 ROOT = Path(__file__).parents[1]
 OUT = ROOT / "docs" / "pictures"
+FORETOLD = ROOT / "experiments" / "reports" / "foretell" / "standin.json"
 RACE = ROOT / "experiments" / "reports" / "race" / "nominal" / "race.json"
 CLOSE_NOTICES = "document.querySelectorAll('.mantine-CloseButton-root').forEach(x => x.click())"
 METHODS = {  # of the race, by plain names, with their lines
@@ -311,11 +314,27 @@ def draw_page(path: Path, run: Path) -> None:
         server.wait()
 
 
+def draw_foretold(path: Path) -> None:
+    """Draw what a log of each of twenty plants foretold, and what was walked."""
+    pairs = json.loads(FORETOLD.read_text())["pairs"]
+    plants = sorted({pair["seed"] for pair in pairs})[:20]
+    cases = {
+        traj: [
+            (pair["foretold"]["L"], pair["walked"]["L"])
+            for pair in pairs
+            if pair["traj"] == traj and pair["seed"] in plants
+        ]
+        for traj in ("straight", "c", "s")
+    }
+    forecasts(path, cases, calibrated(HERE)["L"])
+
+
 PICTURES: dict[str, tuple[Path, Callable[[Path], None] | None]] = {
     "method": (OUT / "method.svg", draw_method),
     "own": (OUT / "own.svg", draw_own),
     "film": (ROOT / "docs" / "walk.webp", draw_film),
     "before-after": (OUT / "before-after.png", draw_before_after),
+    "foretold": (OUT / "foretold.png", draw_foretold),
     "race": (OUT / "race.png", draw_race),
     "robots": (OUT / "robots.png", draw_robots),
     "page": (OUT / "page.png", None),  # takes the run too

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 
 from hector_jax.report.plots import style
 from hector_jax.report.plots.style import SETS, drawing, label_of, log_axis, looks_of
+from hector_jax.verdict.foretell import interval
 
 
 def front(
@@ -112,6 +113,38 @@ def race(path: Path, curves: Mapping[str, Mapping[int, Sequence[float]]]) -> str
         axes.minorticks_off()
         log_axis(axes, "y")
     return "L of the best set so far by walks: median of the repeats, and their range."
+
+
+def forecasts(
+    path: Path, cases: Mapping[str, Sequence[tuple[float, float]]], pairs: Sequence[Sequence[float]]
+) -> str:
+    """Draw what was walked by what was foretold, with the interval of each forecast.
+
+    Args:
+        path: file to write.
+        cases: by trajectory, foretold and walked log ratios of L.
+        pairs: log ratios of the calibration, see `foretell.interval`.
+    """
+    held, count = 0, 0
+    with drawing(path, 9.6, 3.6) as figure:
+        panels = figure.subplots(1, len(cases), sharex=True, sharey=True)
+        for panel, (name, rows) in zip(panels, cases.items(), strict=True):
+            for said, came in rows:
+                _, low, high = interval(said, pairs)
+                inside = bool(low <= came <= high)
+                color, label = (
+                    (style.GREEN, "interval holds") if inside else (style.ORANGE, "it does not")
+                )
+                held, count = held + inside, count + 1
+                at = np.exp(said)
+                panel.vlines(at, *np.exp([low, high]), color=color, alpha=0.35, linewidth=2.5)
+                panel.plot(at, np.exp(came), "o", color=color, markersize=4, label=label)
+            panel.axline((1.0, 1.0), (2.0, 2.0), color="black", linewidth=0.8)
+            panel.set(title=name, xlabel="foretold L / L of the log")
+            log_axis(panel, "x")
+            log_axis(panel, "y")
+        panels[0].set_ylabel("walked L / L of the log")
+    return f"Of {count} walks on the hardware stand-in {held} came within the interval foretold."
 
 
 def survival(path: Path, rows: Mapping[str, Mapping[str, Any]]) -> str:

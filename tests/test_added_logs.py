@@ -29,7 +29,8 @@ from hector_jax.own import walk_log
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import loss_of_robot
-from hector_jax.walk_tuning import added_logs, walks
+from hector_jax.verdict.metrics import Interval
+from hector_jax.walk_tuning import added_logs, forecasts, walks
 
 SECONDS = 0.1
 SPEEDS = {"ahead": (0.5, 0.0), "aside": (0.0, 0.5), "back": (-0.5, 0.0)}
@@ -197,6 +198,48 @@ def test_a_fallen_walk_is_added_as_one(folder, capsys):
     assert (seen["walk"], seen["best"], seen["change"]) == (1, 0, None)
     assert seen["logs"]["ahead"]["fell"] is True
     assert seen["logs"]["ahead"]["seconds"] == pytest.approx(0.04)
+
+
+def told(campaign, walked, waiting, command, path):
+    """A forecast of 20 % less, or none."""
+    ends = Interval(-0.22, -0.4, -0.1)
+    return ends if command.velocity[0, 0] > 0.0 else "no such log"
+
+
+def test_a_proposed_walk_is_foretold_and_its_logs_tell_whether_that_held(
+    folder, monkeypatch, capsys
+):
+    monkeypatch.setattr(forecasts, "_foretell", told)
+    names = "ahead", "aside"
+    next_walk(folder, names)
+    assert result(capsys)["foretold"] == {}
+    add(folder, *(plain(name, error=0.02) for name in names))
+    assert result(capsys)["foretold"] == {}
+    next_walk(folder, names)
+    proposed = result(capsys)["foretold"]
+    assert proposed["aside"] == {"not foretold": "no such log"}
+    assert proposed["ahead"] == {"change": pytest.approx(-19.7, abs=0.1)} | {
+        x: pytest.approx(100 * np.expm1(end)) for x, end in (("low", -0.4), ("high", -0.1))
+    }
+    propose.run_propose(Propose(folder))
+    text = capsys.readouterr().out
+    assert "ahead: L -20 [-33, -9.5] % against walk 0 is foretold\n" in text
+    assert "aside: not foretold: no such log\n" in text
+    for error, held, words in (
+        (0.017, True, ", as foretold"),
+        (0.0199, False, ", not as foretold"),
+    ):
+        logs = [plain(name, error=error) for name in names]
+        walked = loss_of_ahead(folder, error) / loss_of_ahead(folder, 0.02)
+        add(folder, *logs)
+        seen = result(capsys)["foretold"]
+        assert seen["ahead"]["held"] is held
+        assert seen["ahead"]["walked"] == pytest.approx(100 * (walked - 1))
+        add(folder, undo=True)
+        propose.run_add(Add(folder, tuple(logs)))
+        assert f"{words}\n" in capsys.readouterr().out
+        add(folder, undo=True)
+        capsys.readouterr()
 
 
 def test_the_first_logs_can_be_undone_and_others_cannot(folder, capsys):

@@ -268,7 +268,14 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     starts = {path.name for path in (run / "walks" / "starts").iterdir()}
     assert starts == {"best", "with", "without", "start"}
     report = (run / "report.md").read_text()
-    for words in ("hardware stand-in", "## Tuning on walks", "Each weight set walked 1 time "):
+    expected = "On a robot that is not this simulator expect "
+    assert result["elsewhere"]["change"].keys() == {"straight"}
+    for words in (
+        expected,
+        "hardware stand-in",
+        "## Tuning on walks",
+        "Each weight set walked 1 time ",
+    ):
         assert words in report
     for picture in ("tracking", "path", "losses", "weights", "wrenches", "training"):
         assert (run / "pictures" / f"{picture}.png").stat().st_size > 10_000

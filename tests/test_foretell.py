@@ -1,22 +1,39 @@
 """What a log foretells of weights that have not walked: the forecast, its interval, the command."""
 
 import json
+import runpy
 from functools import cache
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 from model import ROBOT
-from pretend import call, refused
+from pretend import call, pretend_verdict, refused
 
 from hector_jax import InputError, Job, RolloutConfig, TuneConfig, expert, named_command, nominal
 from hector_jax.own.walk_log import at_ticks, evaluate_log, log_of
+from hector_jax.report.report import elsewhere_line
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import ideal
 from hector_jax.verdict import foretell as module
-from hector_jax.verdict.foretell import HERE, forecast, foretell, interval, log_ratio, quantities
+from hector_jax.verdict.foretell import (
+    HERE,
+    Carried,
+    carry,
+    forecast,
+    foretell,
+    interval,
+    log_ratio,
+    quantities,
+    widening,
+)
+from hector_jax.verdict.metrics import Interval
 
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+REPORTS = EXPERIMENTS / "reports"
 CONFIG = TuneConfig(rollout=RolloutConfig(ticks=150))
+LARGEST = module._calibration()["pairs"][HERE]["largest"]
 GAINS = {"horizontal_gain": 10.0, "height_gain": 40.0, "tilt_gain": 100.0, "yaw_gain": 50.0}
 
 
@@ -102,6 +119,39 @@ def test_a_foretold_fall_and_weights_too_far_away_have_no_interval():
     far = found._replace(distances={"expert": 5.0})
     with pytest.raises(InputError, match=r"expert: 148.4 times .* measured up to"):
         forecast(far, "expert", HERE)
+
+
+def test_a_log_unlike_those_that_were_measured_has_wider_intervals():
+    found = foretold("nominal", {"expert": expert()})
+    assert 0.0 < found.unexplained < LARGEST
+    assert widening(found, HERE) == 1.0
+    odd = found._replace(unexplained=2.0 * LARGEST)
+    assert widening(odd, HERE) == pytest.approx(2.0)
+    pairs = zip(*(forecast(x, "expert", HERE).values() for x in (found, odd)), strict=True)
+    for usual, wide in pairs:
+        assert wide.value == usual.value
+        assert wide.high - wide.low == pytest.approx(2.0 * (usual.high - usual.low))
+
+
+def test_what_carries_over_to_other_engines_and_masses_is_that_of_the_verdict():
+    columns = json.loads((REPORTS / "verdict" / "verdict.json").read_text())["columns"]
+    script = runpy.run_path(str(EXPERIMENTS / "foretell.py"))
+    assert script["carried_pairs"](columns) == module._calibration()["pairs"]["carried"]
+    carried = carry(pretend_verdict(8), "with")
+    assert 0.85 <= carried.held / carried.walks <= 0.95
+    (change,) = carried.change.values()
+    assert change.low < change.value < change.high
+    line = elsewhere_line(carried)
+    assert line.startswith("On a robot that is not this simulator expect ")
+    assert f"(90 %; held in {carried.held} of {carried.walks} walks of other sets" in line
+    less = Carried({"s": Interval(-70.0, -79.2, -63.4)}, 58, 64)
+    assert "63 to 79 % less loss than with nominal on s (90 %; held in 58 of 64" in elsewhere_line(
+        less
+    )
+    either = Carried({"s": Interval(-1.0, -8.0, 6.0)}, 58, 64)
+    assert "up to 8 % less or 6 % more loss" in elsewhere_line(either)
+    assert carry(pretend_verdict(8, {("with", i) for i in range(8)}), "with").change == {}
+    assert elsewhere_line(Carried({}, 58, 64)) == ""
 
 
 @pytest.mark.slow

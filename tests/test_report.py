@@ -42,6 +42,7 @@ def written(folder, verdict=None, **others):
         "environment": environment(),
         "command": "make tune TRAJ=straight",
         "run": "latest",
+        "elsewhere": "",
         "walks": None,
         "smooth": 10.0,
         "draws": 4,

@@ -2,34 +2,29 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from hector_jax.cli import arguments
 from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import Foretell
-from hector_jax.control.reference import Command
 from hector_jax.core.console import say
-from hector_jax.core.inputs import InputError
-from hector_jax.own.log_check import check_log, read_check
 from hector_jax.own.planner import call_planner
-from hector_jax.own.walk_file import read_walk, reference_of
-from hector_jax.own.walk_log import at_ticks, log_of
-from hector_jax.robot.model import Robot, load_robot
+from hector_jax.robot.model import load_robot
 from hector_jax.store import tunings
-from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.verdict import metrics
 from hector_jax.verdict.foretell import (
     COVERAGE,
-    ELSEWHERE,
     HERE,
     Foretold,
     forecast,
     foretell,
+    group_of,
+    held_by_means,
     quantities,
+    read_logged,
+    widening,
 )
 from hector_jax.verdict.metrics import Interval
 
@@ -58,43 +53,17 @@ def run_foretell(args: Foretell) -> None:
     tick = config.rollout.walk.gait.tick
     with arguments.logs_of(args, args.logs, robot, seconds, tick) as paths:
         for path in paths:
-            walk, score = _read(path, config, robot, trajectory.command)
+            walk, score = read_logged(path, config, robot, trajectory.command)
             logged.append(quantities(score))
             found.append(foretell(config, robot, trajectory.command, walk, sets, **options))
-        is_here = args.robot is None and all(map(_is_ours, paths))
-    group = HERE if is_here else ELSEWHERE
+        group = group_of(robot, paths, called=planner is not None)
     result = {
         "walked": {"name": args.walked, **_mean(logged)},
         "sets": {name: _set_result(found, name, group, _mean(logged)) for name in sets},
         "calibration": group,
+        "wider": max(widening(one, group) for one in found),
     }
     print_result(args.json, result, lambda: print(*_lines(result, len(found)), sep="\n"))
-
-
-def _read(path: Path, config: TuneConfig, robot: Robot, command: Command) -> tuple[Any, Any]:
-    """Return a log at the plan interval and the score of its walk.
-
-    Raises:
-        InputError: it has faults that no weight can mend, so that it foretells nothing; or it fell.
-    """
-    controller = config.rollout.walk
-    tick, seconds = controller.gait.tick, config.rollout.ticks * controller.gait.tick
-    checked, _ = read_check(path, robot, command, seconds, tick)
-    if faults := check_log(checked, controller.plan_interval):
-        raise InputError(f"{path} foretells nothing: {faults[0]}")
-    walk, end = read_walk(path, robot, seconds, tick)
-    if end:
-        raise InputError(f"{path} foretells nothing: {end}")
-    reference = jax.tree.map(np.asarray, reference_of(tick, robot, command, walk))
-    score = metrics.score(config.loss, walk._replace(reference=reference))
-    return at_ticks(log_of(walk), tick), score
-
-
-def _is_ours(path: Path) -> bool:
-    """Tell whether `hector walk` wrote a log, in MuJoCo."""
-    with np.load(path, allow_pickle=False) as archive:
-        card = str(archive["card"]) if "card" in archive.files else ""
-    return '"engine": "c"' in card and '"kind": "trajectory"' in card
 
 
 def _mean(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
@@ -142,8 +111,13 @@ def _lines(result: Mapping[str, Any], logs: int) -> Iterator[str]:
         yield "  ".join([first.ljust(widths[0]), *cells])
     of = "HECTOR in this simulator" if result["calibration"] == HERE else "other robots and engines"
     yield f"in brackets {100 * COVERAGE:.0f} % intervals, by forecasts that were walked: {of}"
+    if (wider := result["wider"]) > 1.0:
+        text = f"{wider:.1f} times as wide as measured: the rigid body explains less of this walk"
+        yield f"they are {text} than of any that was measured"
     if logs > 1:
-        yield f"means of {logs} logs"
+        counted = held_by_means(result["calibration"], logs)
+        held = "held in {} of {} cases".format(*counted) if counted else "that was not measured"
+        yield f"means of {logs} logs, with intervals of one: {held}"
     for name, row in result["sets"].items():
         if row["falls"]:
             yield f"{name} falls in its foretold walk: the numbers of its row are no forecast"

@@ -22,8 +22,11 @@ from hector_jax.own import walk_log
 from hector_jax.robot.model import load_robot
 from hector_jax.store import tunings
 from hector_jax.store.run import CONFIG
+from hector_jax.verdict import metrics
+from hector_jax.verdict.metrics import Interval
 from hector_jax.walk_tuning import added_logs, best_set, walks
 from hector_jax.walk_tuning.campaign import Campaign
+from hector_jax.walk_tuning.forecasts import foretell_next, walked_next
 from hector_jax.walk_tuning.moved import numbers_by_walks
 
 
@@ -38,14 +41,18 @@ def run_propose(args: Propose) -> None:
     with locked(args.folder), workers(PROCESSES) as pool:
         found = added_logs.read_campaign(pool, campaign)
         write_json(path, {"flags": as_table(args)})  # last, so that rejected flags can be corrected
+        told = foretell_next(pool, campaign, found)
     number, ended = found.number, found.tuning.reason
     weights = walks.weights_path(args.folder, number)
     result = {"walk": number, "weights": str(weights), "ended": ended}
+    result["foretold"] = {name: _told(one) for name, one in told.items()}
 
     def print_text() -> None:
         names = ", ".join(campaign.commands)
         again = f", the best set again ({ended})" if ended else ""
         print(f"walk {number}{again}: {weights}")
+        for name, one in result["foretold"].items():
+            print(f"{name}: {_told_text(one, found.tuning.best)}")
         print(f"to be walked on {names} for {campaign.seconds:g} s each; then:")
         logs = " ".join(f"{name}.npz" for name in campaign.commands)
         print(f"hector log add {args.folder} {logs}")
@@ -68,7 +75,8 @@ def run_add(args: Add) -> None:
     bags = arguments.logs_of(args, [*given.values()], campaign.robot, *length)
     with locked(args.folder), workers(PROCESSES) as pool, bags as paths:
         files = dict(zip(given, paths, strict=True))
-        number = added_logs.read_campaign(pool, campaign).number
+        before = added_logs.read_campaign(pool, campaign)
+        number, told = before.number, foretell_next(pool, campaign, before)
         named = [name for name, _ in map(named_file, texts)]
         tracked = _check_logs(campaign, number, files, named)
         added_logs.add_logs(campaign, number, list(files.values()))
@@ -79,6 +87,8 @@ def run_add(args: Add) -> None:
     weights = walks.weights_path(args.folder, best)
     result = {"walk": number, "change": change, "best": best, "weights": str(weights)}
     result |= {"again": again and again._asdict(), "ended": found.tuning.reason}
+    walked = walked_next(before, found, campaign.commands)
+    result["foretold"] = {name: _told(one, walked.get(name)) for name, one in told.items()}
 
     def print_text() -> None:
         chosen = f"{_text(changes[best])}, in the walk that chose it"
@@ -86,6 +96,8 @@ def run_add(args: Add) -> None:
             chosen = f"{_text(again.change)}, in walks that did not choose it"
         if again and not again.clear:
             chosen += ": not distinguishable from the start"
+        for name, one in result["foretold"].items():
+            print(f"{name}: {_told_text(one, before.tuning.best)}")
         print(f"walk {number}: {_text(change)}; best is walk {best}, {chosen}")
         print(f"its weights: {weights}; the next ones: hector propose {args.folder}")
 
@@ -162,6 +174,30 @@ def _tracking_text(tracked: Mapping[str, Any]) -> str:
 
 def _text(change: float | None) -> str:
     return "fell" if change is None else f"L {change:+.1f} % against the start"
+
+
+def _told(told: Interval | str, walked: float | None = None) -> dict[str, Any]:
+    """Return a forecast as JSON values: changes of L [%], and what was walked of it."""
+    if isinstance(told, str):
+        return {"not foretold": told}
+    low, high = (None if np.isnan(x) else 100.0 * float(np.expm1(x)) for x in told[1:])
+    found = {"change": 100.0 * float(np.expm1(told.value)), "low": low, "high": high}
+    if walked is None or not np.isfinite(walked):
+        return found
+    held = None if low is None else bool(told.low <= walked <= told.high)
+    return found | {"walked": 100.0 * float(np.expm1(walked)), "held": held}
+
+
+def _told_text(told: Mapping[str, Any], best: int) -> str:
+    """Return the line of a forecast against the best set before it, walked or not."""
+    if "not foretold" in told:
+        return f"not foretold: {told['not foretold']}"
+    ends = (np.nan if told[x] is None else told[x] for x in ("low", "high"))
+    text = f"L {Interval(told['change'], *ends).text()} % against walk {best} is foretold"
+    if "walked" not in told:
+        return text
+    held = {True: "as foretold", False: "not as foretold", None: "foretold without an interval"}
+    return f"{text}; walked {metrics.percent(told['walked'])} %, {held[told['held']]}"
 
 
 def _campaign(args: Propose) -> Campaign:

@@ -30,10 +30,10 @@ from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.network import as_effect
 from hector_jax.report import fidelity, pictures
-from hector_jax.report.report import Picture, first_lines, print_tables
+from hector_jax.report.report import Picture, elsewhere_line, first_lines, print_tables
 from hector_jax.report.run import write_run_report
 from hector_jax.report.video import check_film
-from hector_jax.robot.model import load_robot
+from hector_jax.robot.model import describe, load_robot
 from hector_jax.sim.diagnosis import fall_of
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
@@ -45,6 +45,7 @@ from hector_jax.tuning.curvature import Determined, determined
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.evaluate import aligned
 from hector_jax.verdict import judging, metrics
+from hector_jax.verdict.foretell import Carried, carry
 from hector_jax.verdict.judging import Judged
 from hector_jax.walk_tuning import best_set
 from hector_jax.walk_tuning.campaign import Campaign
@@ -162,12 +163,14 @@ def _tune_in(folder: Path, args: Tune) -> None:
     config, precision = run.setup.config, tuned.tunings["with"].precision
     known = determined(precision, config.ridge, step_names(run.start, config.others))
     worlds = {"standin": standin.verdict, "hfs": on_hfs.verdict}
-    result = _result(run, tuned, worlds, known)
+    carried = _carried(run, standin.verdict)
+    result = _result(run, tuned, worlds, known, carried)
     write_json(folder / VERSIONS, made_with | {"seconds": f"{time.monotonic() - start_time:.0f}"})
     report = write_run_report(
         folder,
         run=str(folder),
         trajectory=run.name,
+        elsewhere=elsewhere_line(carried) if carried else "",
         verdict=standin.verdict,
         norms=norms,
         determined=known,
@@ -182,18 +185,26 @@ def _tune_in(folder: Path, args: Tune) -> None:
         environment=made_with,
         command=as_command("hector tune", run_folder.run_flags(args)),
     )
-    _print(run, result, standin.verdict)
+    _print(run, result, standin.verdict, carried)
     say(f"the report is {report}")
 
 
-def _print(run: _Run, result: Mapping[str, Any], verdict: metrics.Verdict) -> None:
+def _carried(run: _Run, verdict: metrics.Verdict) -> Carried | None:
+    """Return what `best` may bring on another robot; None if that was not measured: not HECTOR."""
+    return carry(verdict, "best") if run.setup.robot.description == describe() else None
+
+
+def _print(
+    run: _Run, result: Mapping[str, Any], verdict: metrics.Verdict, carried: Carried | None
+) -> None:
     """Print the result of a run."""
     newest = latest_run()
     text = "latest" if newest and newest.samefile(run.folder) else str(run.folder)
 
     def print_text() -> None:
         print(*first_lines(verdict, text), "", sep="\n")
-        print_tables(verdict)
+        line = elsewhere_line(carried) if carried else ""
+        print_tables(verdict, more=[line] if line else [])
 
     print_result(run.args.json, {"run": str(run.folder), "traj": run.name, **result}, print_text)
 
@@ -311,12 +322,19 @@ def _say_worse(name: str, on_hfs: metrics.Verdict) -> None:
 
 
 def _result(
-    run: _Run, tuned: _Tuned, verdicts: Mapping[str, metrics.Verdict], known: Determined
+    run: _Run,
+    tuned: _Tuned,
+    verdicts: Mapping[str, metrics.Verdict],
+    known: Determined,
+    carried: Carried | None,
 ) -> dict[str, Any]:
     """Write result.json, with the verdict in each world; return its content."""
     result = metrics.verdict_result(verdicts)
     if tuned.walks:
         result |= {"walks": tuned.walks.rows, "walks_begun_with": tuned.begun_with}
+    if carried:
+        change = {scene: ends._asdict() for scene, ends in carried.change.items()}
+        result["elsewhere"] = {**carried._asdict(), "change": change}
     directions = [direction._asdict() for direction in known.directions]
     result["determined"] = {"directions": directions, "weights": known.weights}
     write_json(run.folder / RESULT, result)

@@ -21,6 +21,7 @@ from rich.text import Text
 
 from hector_jax.core.inputs import plural
 from hector_jax.verdict import metrics
+from hector_jax.verdict.foretell import Carried
 from hector_jax.verdict.metrics import BASELINES, Comparison, Summary, Verdict
 
 # titles of worlds that differ from their names
@@ -133,6 +134,24 @@ def first_lines(verdict: Verdict, run: str) -> list[str]:
     errors = {name: plain_errors(verdict, name) for name in (tuned, *baselines(verdict))}
     falls = {name: int(summaries(verdict)[name].falls) for name in errors}
     return render("first.txt.j2", verdict=verdict, errors=errors, falls=falls, run=run).splitlines()
+
+
+def elsewhere_line(carried: Carried) -> str:
+    """Say what a set may bring on a robot that is not the simulator; empty if nothing can be."""
+    if not carried.change:
+        return ""
+    each = [f"{_less(low, high)} on {scene}" for scene, (_, low, high) in carried.change.items()]
+    held = f"held in {carried.held} of {carried.walks} walks of other sets, engines and masses"
+    return f"On a robot that is not this simulator expect {', '.join(each)} (90 %; {held})."
+
+
+def _less(low: float, high: float) -> str:
+    """Write the interval of a change of the loss [%] in words."""
+    if low < 0.0 < high:
+        return f"up to {-low:.0f} % less or {high:.0f} % more loss than with nominal"
+    ends = sorted((abs(low), abs(high)))
+    word = "less" if high <= 0.0 else "more"
+    return "{:.0f} to {:.0f} % {} loss than with nominal".format(*ends, word)
 
 
 def baselines(verdict: Verdict) -> list[str]:

@@ -22,6 +22,7 @@ def write_run_report(folder: Path, **contents: Any) -> Path:
     Args:
         folder: where the pictures are.
         contents: all of these:
+            elsewhere: line of what to expect on another robot; may be empty.
             trajectory, verdict: names of the trajectories; verdict of all sets on the stand-in.
             tunings: by set, `without`, `with` and `best`.
             norms: gradient norms of the terms in log-weights at nominal, by model.
