@@ -261,7 +261,7 @@ def words(text):  # a bar of a table is no word
 
 def test_pages_keep_their_budgets():
     count = {page: words(page.read_text()) for page in PAGES if page.stem != "commands"}
-    assert sum(count.values()) <= 16_000
+    assert sum(count.values()) <= 18_000
     assert {page.name: n for page, n in count.items() if n > 1200} == {}
     assert sum(n for page, n in count.items() if page.stem.startswith("decisions")) <= 2500
     for name, most in {"CHANGELOG.md": 900, "experiments/notes.md": 2500}.items():
