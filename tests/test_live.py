@@ -12,15 +12,19 @@ import numpy as np
 import pytest
 from browser import CHROMIUM, opened
 from model import EXAMPLES, ROBOT
-from pretend import refused
+from pretend import HandsOver, refused
 
 from hector_jax import Job, walk
 from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal, weights_to_vector
-from hector_jax.control.weights_file import best, load_weights
-from hector_jax.report.live import Session, count_compilations
-from hector_jax.report.live_tuning import take_step, what_matters
+from hector_jax.control.weights_file import best, load_weights, weights_tree
+from hector_jax.report.live import Frame, Session, count_compilations
+from hector_jax.report.live_tuning import Tuner, take_step, what_matters
+from hector_jax.report.live_weights import Setup
+from hector_jax.report.view import opened_server
+from hector_jax.report.view_live import LivePage
+from hector_jax.robot.model import compile_model
 from hector_jax.sim.world import hfs, hfs_even
 
 PLANT = hfs(ROBOT.description)
@@ -142,6 +146,59 @@ def test_what_is_not_live_is_refused_in_a_line(monkeypatch, capsys, tmp_path):
     assert "no flag '--walker'" in line("--live", "--walker", own)
 
 
+class Wire:
+    """A pipe to a session that answers at once."""
+
+    def __init__(self, session):
+        self.session, self.answers = session, []
+
+    def send(self, call):
+        """Do what a page calls."""
+        name, values = call
+        answer = getattr(self.session, name)(*values)
+        self.answers += [answer] if answer is not None else []
+
+
+def test_a_page_shows_what_the_walk_is_at_and_turns_undoes_and_saves_weights(monkeypatch, tmp_path):
+    pytest.importorskip("viser", reason="viser, of the extra view, is not installed")
+    monkeypatch.chdir(tmp_path)
+    found, named = Session(ROBOT, [job()]), {"nominal": nominal(ROBOT), "expert": expert(ROBOT)}
+
+    def line(files, world, seed):
+        return f"hector view --live --weights {' '.join(files)} --world {world} --seed {seed}"
+
+    model, sets = compile_model(ROBOT.description), {"nominal": nominal(ROBOT)}
+    setup = Setup(ROBOT, model, sets, ["nominal"], named, "hfs", 0, line)
+    go(found, 0.5)
+    with opened_server("127.0.0.1", 0) as (server, _):
+        page = LivePage(server, setup, Wire(found), Tuner(HandsOver(), ROBOT))
+        page.show(Frame(*found.frame(), 0.4, 1.0, 0))
+        assert "0.40: **this machine is too slow** for 1" in page._status.content
+        assert "**nominal**: 0.5 s; QP solved; " in page._status.content
+        assert re.search(r"(left|right) \d+ N, \d+ % of friction", page._status.content)
+        assert "| **nominal** now | " in page._table.content
+        slider = page._weights._sliders["Q_pitch"][0]
+        assert slider.label == "Q_pitch = 50 1/rad²"
+        page._weights._turn("Q_pitch", 2.0)
+        assert slider.label == "Q_pitch = 100 1/rad²"
+        assert found.walks[0].job.weights.Q.euler[1] == pytest.approx(100.0)
+        page._weights._save()
+        assert (
+            "hector view --live --weights live.json --world hfs --seed 0"
+            in page._weights._line.content
+        )
+        saved = load_weights(tmp_path / "live.json", ROBOT)
+        assert weights_tree(saved) == weights_tree(found.walks[0].job.weights)
+        page._weights._undo_last()
+        assert weights_tree(found.walks[0].job.weights) == weights_tree(nominal(ROBOT))
+        page._weights._file.value = "../there.json"
+        page._weights._save()
+        assert not (tmp_path.parent / "there.json").exists()
+        page._ask("step")
+        page.tune(found.log(0))
+        assert page._found.content.startswith("Not yet: ")
+
+
 def until(seconds, seen):
     end = time.monotonic() + seconds
     while not (found := seen()):
@@ -160,9 +217,9 @@ def test_a_person_turns_pushes_and_saves_in_a_browser(tmp_path):
     with subprocess.Popen(words, **pipes) as page:
         try:
             address = next(line for line in page.stderr if line.startswith("open http")).split()[1]
-            with (
-                opened(address, tmp_path / "one") as tab,
-                opened(address, tmp_path / "two") as other,
+            with (  # small, because they draw without a graphics card
+                opened(address, tmp_path / "one", 300) as tab,
+                opened(address, tmp_path / "two", 300) as other,
             ):
 
                 def at(what, one=tab):
