@@ -19,6 +19,7 @@ from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.inputs import InputError
 from hector_jax.own.planner import (
     _closest,
+    _convention,
     call_planner,
     called_plans,
     compare_calls,
@@ -30,7 +31,7 @@ from hector_jax.own.walk_log import at_ticks, log_of, trajectory_of
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
-from hector_jax.tuning.called import Planned, call_along
+from hector_jax.tuning.called import Planned, call_along, call_rows
 from hector_jax.tuning.curvature import least_squares_jit
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.grounded import fit_grounding, grounded_rollout
@@ -187,6 +188,24 @@ def test_another_convention_of_the_plans_is_found(walked, change, fit):
     assert calls.parity.plans == len(inputs.time)
     assert calls.unused_weights == step_names(WEIGHTS)
     assert (calls.memory, calls.jumps, calls.touchdowns_follow) == (0.0, 0.0, True)
+
+
+def test_a_planner_that_is_asked_with_other_units_of_its_cost_or_other_angles_is_told(walked):
+    rows = np.arange(1, 24)
+    logged = np.concatenate(walked.command, axis=-1)[1:][rows]
+    for told in ("0.5 times R", "the angles yaw, pitch, roll"):
+        turned, factor = told.startswith("the"), 1.0 if told.startswith("the") else 2.0
+        weights = WEIGHTS._replace(R=jax.tree.map(lambda x, k=factor: k * x, WEIGHTS.R))
+        inputs = plan_inputs(CONFIG, ROBOT, weights, COMMAND, walked)
+
+        def call(asked, turned=turned):
+            euler = asked.state.euler[:, ::-1] if turned else asked.state.euler
+            return this_controller(asked._replace(state=asked.state._replace(euler=euler)))
+
+        plans = {"logged": logged, "called": call_rows(call, inputs, rows)[..., :6], "least": 0.2}
+        words, distance = _convention(call, CONFIG, inputs, rows, **plans)
+        assert words == (f"if it is asked with {told}",)
+        assert distance < 0.2
 
 
 @pytest.mark.parametrize(("axes", "into"), [*product(("heading", "trunk"), (True, False))])
