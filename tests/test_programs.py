@@ -48,7 +48,7 @@ def test_walks_of_robot_after_robot_free_the_programs_of_the_last(monkeypatch):
     robots = [load_robot(EXAMPLES / x / "robot.toml") for x in ("strider", "humanoid")]
     counts, walks = [], []
     for robot in (*robots, *robots):
-        job = Job(nominal(robot), named_command("straight"), ideal(), 0.1)
+        job = Job(nominal(robot), named_command("straight"), ideal(robot.description), 0.05)
         walks.append(walk(walk_config(robot), robot, job))
         counts.append(live())
     assert max(counts[2:]) <= max(counts[:2]) + 2
