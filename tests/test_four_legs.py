@@ -295,7 +295,7 @@ def test_a_shank_without_a_foot_stands_on_a_point_that_is_guessed_from_its_inert
     bare = ('size="0.012"', 'size="0.012" contype="0" conaffinity="0"')  # 0.202 m long
     proposal = propose_robot(changed(tmp_path, ('<geom class="foot"/>', ""), bare))
     assert proposal.error is None
-    assert any("guessed" in line for line in proposal.wrong)
+    assert any("guessed" in line for line in proposal.guesses)
     for sole in proposal.soles:
         assert sole.guessed
         assert len(sole.contacts) == 1

@@ -32,6 +32,7 @@ from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.diagnosis import Fall, fall_of
 from hector_jax.sim.engine import MUJOCO_C
+from hector_jax.sim.leg_check import soles_held
 from hector_jax.sim.loop import Job
 from hector_jax.store import nets
 from hector_jax.store.collection import Walks
@@ -97,6 +98,8 @@ def run_walk(args: Walk) -> None:
     result |= {name: getattr(score, name).tolist() for name in ("rms_position", "rms_euler")}
     result |= {"plans": len(residuals), "unsolved": unsolved, "residual": float(score.residual)}
     print_result(args.json, result, partial(_print_walk, title, result, score, loss, fall))
+    if args.robot is not None and args.world != "srbm" and not (args.json or args.walker):
+        print(soles_held(plant or robot, trajectory))
     if unsolved:
         raise Broken(
             f"{unsolved} of {plural(len(residuals), 'QP')} were not solved (largest relative "

@@ -196,7 +196,8 @@ def _sole_lines(soles: Sequence[Sole]) -> Iterator[str]:
             f"the sole of body {body!r} is guessed from its inertia, {soles[0].guessed}: "
             f"{size.get(count, f'{length:.1f} x {width:.1f} cm')}, {-100.0 * low[2]:.1f} cm below "
             "its joint; measure heel, toe and height of the sole on the robot or in its drawing "
-            f"and correct the contacts of {feet}, which are in the body's frame [m]"
+            f"and correct the contacts of {feet}, in the body's frame [m]; "
+            "hector walk says whether they hold"
         )
 
 

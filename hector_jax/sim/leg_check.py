@@ -212,6 +212,29 @@ def _told(guess: LogChange, robot: Robot, feet: np.ndarray) -> str:
     return " ".join(guess.words.format(which).split())
 
 
+def soles_held(robot: Robot, walk: Trajectory) -> str:
+    """Return one line that says whether the soles of the robot's file hold: slide, and height.
+
+    Args:
+        robot: that walked, with its plan.
+        walk: of a world with a plant (numpy).
+    """
+    walk = jax.tree.map(lambda x: np.asarray(x), walk._replace(belief=None))
+    good = ~walk.fallen
+    stance = (walk.contact & (walk.effect.force[..., 2] > 0.0))[good]
+    if not stance.any():
+        return "soles: no foot stood"
+    R = np.asarray(jax.vmap(rotation_from_euler)(walk.state.euler[good]))
+    soles = np.asarray(_soles(robot, walk.joints[good]))
+    found = _stand(soles, R, walk.state.position[good], stance, float(walk.period))
+    slide, off = found.slide.max(), 100.0 * np.abs(found.height).max()
+    text = (
+        f"soles: feet that stand slide at {slide:.2f} m/s, foot points {off:.1f} cm off the floor"
+    )
+    held = slide <= SLIDING and off <= 100.0 * STEADY
+    return text + ("" if held else ": they do not hold, measure feet in the robot's file")
+
+
 def legs_found(robot: Robot, walk: Trajectory, stance: Bool[np.ndarray, "n feet"]) -> Iterator[str]:
     """Yield a line for each fault of joints, feet or angles; foot and joint are named.
 

@@ -30,6 +30,7 @@ from hector_jax.sim import loop, mjx_model, sensing
 from hector_jax.sim.actuators import Motors, init_actuators, step_actuators
 from hector_jax.sim.loop import Job, Sample, first_tick, substeps
 from hector_jax.sim.mjx_model import mjx
+from hector_jax.sim.programs import make_room
 from hector_jax.sim.sensing import Touches
 from hector_jax.sim.world import build_worlds, push_force, standing_qpos
 
@@ -329,6 +330,7 @@ def walk_batch(
     if not jobs:
         return iter(())
     _check_batch(jobs)
+    make_room(robot.description)
     ticks = [loop.walk_ticks(config, job.seconds, int(job.start_tick)) for job in jobs][0]
     body = jobs[0].body(robot)
     worlds = build_worlds([job.imperfections for job in jobs], body.description)

@@ -35,6 +35,7 @@ from hector_jax.sim.actuators import init_actuators, step_actuators
 from hector_jax.sim.loop import Job, Sample, first_tick, substeps
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.plant import BuildPlant, Plant
+from hector_jax.sim.programs import by_robot, make_room
 from hector_jax.sim.sensing import Ground
 from hector_jax.sim.world import push_force
 
@@ -51,7 +52,7 @@ def _anchor(robot: Robot, reading: Array, yaw: Array, start_tick: Array) -> Anch
     return anchor_at(robot, state, start_tick)
 
 
-@cache
+@by_robot
 def _sampler(config: WalkConfig, constants: Layout, inputs: Layout) -> Callable[..., Sample]:
     """Compile the samples of a block of ticks.
 
@@ -118,10 +119,10 @@ class _Planner:
         self.plan = jax.jit(plan, compiler_options=options)
 
 
-_planner = cache(_Planner)
+_planner = by_robot(_Planner)
 
 
-@cache
+@by_robot
 def _torques(config: WalkConfig, *layouts: Layout) -> Callable[..., Array]:
     """Compile the torques of a millisecond, from packed trees to the next state, packed.
 
@@ -182,6 +183,7 @@ def walk(
         InputError: the plant's file or numbers are wrong or not supported by the engine, or the
             length is no positive number of ticks.
     """
+    make_room(robot.description)
     count, ticks = substeps(config), loop.walk_ticks(config, job.seconds, job.start_tick)
     lead, length = (job.start_tick - first_tick(config)) * count, ticks * count
     plant = build(job, job.body(robot), -lead, length)
