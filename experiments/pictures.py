@@ -315,14 +315,14 @@ def draw_page(path: Path, run: Path) -> None:
 
 
 def draw_foretold(path: Path) -> None:
-    """Draw what a log of each of twenty plants foretold, and what was walked."""
+    """Draw what a log of each of 22 plants foretold, and what was walked."""
     pairs = json.loads(FORETOLD.read_text())["pairs"]
-    plants = sorted({pair["seed"] for pair in pairs})[:20]
+    plants = sorted({pair["seed"] for pair in pairs})[:22]
     cases = {
         traj: [
             (pair["foretold"]["L"], pair["walked"]["L"])
             for pair in pairs
-            if pair["traj"] == traj and pair["seed"] in plants
+            if pair["traj"] == traj and pair["seed"] in plants and pair["far"]
         ]
         for traj in ("straight", "c", "s")
     }

@@ -589,6 +589,19 @@ def other_pages():
     held = sum(low <= came <= high for (_, low, high), came in ends)
     text = f"{held} of {len(pairs)} held what came, of {0.9 * len(pairs):.0f} that should"
     yield DOCS / "howto" / "walks.md", text
+    cases = report("foretell/cases.json")
+    shifted = [pair for pair in cases["pairs"] if pair["world"] == "shifted"]
+    ends = [(foretell.interval(x["foretold"]["L"], known), x["walked"]["L"]) for x in shifted]
+    held = sum(low <= came <= high for (_, low, high), came in ends)
+    text = "{refused} of {logs} logs were refused; of the".format(**cases["refused"]["shifted"])
+    yield DOCS / "howto" / "walks.md", f"{text} {len(shifted)} forecasts by the others {held} held"
+    off = [x["walked"]["L"] - x["foretold"]["L"] for x in cases["pairs"] if x["robot"] == "own"]
+    close = sum(abs(x) < 0.04 for x in off)
+    text = (
+        f"Of {len(off)} forecasts for the [planner](own.md#the-planner) of the example {close} were"
+    )
+    yield DOCS / "howto" / "walks.md", text
+    assert {round(np.exp(x)) for x in off if abs(x) > 0.04} == {5}
     carried = foretell.carry(pretend_verdict(8), "with")
     text = f"held {carried.held} of {carried.walks} walks of the other set"
     yield DOCS / "howto" / "walks.md", text
