@@ -21,7 +21,7 @@ from hector_jax.control.weights import expert, nominal, weights_to_vector
 from hector_jax.control.weights_file import best, load_weights, weights_tree
 from hector_jax.report.live import Frame, Session, count_compilations
 from hector_jax.report.live_tuning import Tuner, take_step, what_matters
-from hector_jax.report.live_weights import Setup
+from hector_jax.report.live_weights import PageSetup
 from hector_jax.report.view import opened_server
 from hector_jax.report.view_live import LivePage
 from hector_jax.robot.model import compile_model
@@ -168,7 +168,7 @@ def test_a_page_shows_what_the_walk_is_at_and_turns_undoes_and_saves_weights(mon
         return f"hector view --live --weights {' '.join(files)} --world {world} --seed {seed}"
 
     model, sets = compile_model(ROBOT.description), {"nominal": nominal(ROBOT)}
-    setup = Setup(ROBOT, model, sets, ["nominal"], named, "hfs", 0, line)
+    setup = PageSetup(ROBOT, model, sets, ["nominal"], named, "hfs", 0, line)
     go(found, 0.5)
     with opened_server("127.0.0.1", 0) as (server, _):
         page = LivePage(server, setup, Wire(found), Tuner(HandsOver(), ROBOT))

@@ -17,7 +17,7 @@ from hector_jax.core.inputs import InputError, require_package
 from hector_jax.core.runtime import start_process, workers
 from hector_jax.report.live import simulate
 from hector_jax.report.live_tuning import Tuner
-from hector_jax.report.live_weights import Setup
+from hector_jax.report.live_weights import PageSetup
 from hector_jax.report.view import opened_server
 from hector_jax.report.view_live import serve_live
 from hector_jax.robot.model import Robot, compile_model, load_robot
@@ -56,7 +56,7 @@ def run_live(args: View) -> None:
         return shlex.join([*words, "--world", world, "--seed", str(seed)])
 
     model = compile_model(robot.description)
-    setup = Setup(
+    setup = PageSetup(
         robot, model, sets, list(args.weights), _named(robot), args.world, args.seed, line
     )
     here, there = Pipe()

@@ -58,7 +58,7 @@ def grounded(config: TuneConfig, robot: Robot, walked: Walked) -> Grounding:
     return fit(np.int32(walked.start_tick), anchor=walked.anchor)
 
 
-def slope(
+def grounded_slope(
     config: TuneConfig, grounding: Grounding, weights: Weights
 ) -> tuple[Evaluation, np.ndarray]:
     """Return loss, gradient and Gauss-Newton matrix of a walk."""
@@ -76,7 +76,7 @@ def take_step(
     if state is None:
         state = difftune.init(config, walked.weights)
     weights = jax.tree.map(np.asarray, difftune.trial_weights(config, state))
-    evaluation, matrix = slope(config, grounded(config, robot, walked), weights)
+    evaluation, matrix = grounded_slope(config, grounded(config, robot, walked), weights)
     fixed = replace(config, loss=PAPER_LOSS)
     state, iteration = difftune.update(fixed, state, evaluation, matrix)
     after = jax.device_get(difftune.trial_weights(config, state))
@@ -106,7 +106,7 @@ def what_matters(robot: Robot, walked: Walked) -> str:
     config = settings(robot)
     start = difftune.init(config, walked.weights).start
     grounding = grounded(config, robot, walked)
-    evaluation, matrix = slope(config, grounding, jax.tree.map(np.asarray, start))
+    evaluation, matrix = grounded_slope(config, grounding, jax.tree.map(np.asarray, start))
     precision = matrix / float(evaluation.loss) + config.ridge * np.eye(len(matrix))
     names = parameters.step_names(start)
     now, lines = np.asarray(_errors(config.rollout, grounding, start)), []

@@ -35,7 +35,7 @@ _GROUPS = {  # names and units of the weights
 _STEP = 0.02  # of a slider, in decades
 
 
-class Setup(NamedTuple):
+class PageSetup(NamedTuple):
     """What a page is opened with."""
 
     robot: Robot
@@ -55,7 +55,7 @@ class WeightsPanel:
         self,
         gui: Any,
         when: Callable[[Any, Callable[..., None]], Any],
-        setup: Setup,
+        setup: PageSetup,
         send: Callable[..., None],
         line: Callable[[Sequence[str]], str],
     ) -> None:

@@ -19,7 +19,7 @@ from hector_jax.core.headless import mujoco
 from hector_jax.core.trajectory import FEET, SOLVED
 from hector_jax.report.live import Frame, Walked
 from hector_jax.report.live_tuning import Tuner
-from hector_jax.report.live_weights import Setup, WeightsPanel
+from hector_jax.report.live_weights import PageSetup, WeightsPanel
 from hector_jax.report.motion import INK
 from hector_jax.report.plots.style import rgb_of
 from hector_jax.report.view_parts import add_floor, body_meshes, plot
@@ -33,7 +33,7 @@ _SIDES = {"from behind": (1, 0), "from ahead": (-1, 0), "from the right": (0, 1)
 _SIDES |= {"from the left": (0, -1)}
 
 
-def serve_live(server: Any, setup: Setup, connection: Connection, tuner: Tuner) -> None:
+def serve_live(server: Any, setup: PageSetup, connection: Connection, tuner: Tuner) -> None:
     """Show frames and do what clients want until interrupted."""
     page = LivePage(server, setup, connection, tuner)
     while True:
@@ -50,7 +50,7 @@ def serve_live(server: Any, setup: Setup, connection: Connection, tuner: Tuner) 
 class LivePage:
     """The page in the browser."""
 
-    def __init__(self, server: Any, setup: Setup, connection: Connection, tuner: Tuner) -> None:
+    def __init__(self, server: Any, setup: PageSetup, connection: Connection, tuner: Tuner) -> None:
         """Build the page on a `viser.ViserServer`."""
         self._server, self._setup, self._tuner = server, setup, tuner
         self._send = lambda name, *values: connection.send((name, values))

@@ -101,6 +101,9 @@ class LiveWalk:
 
     def set_job(self, job: Job) -> None:
         """Go on with other weights, and the same command and plant."""
+        integral = self._config.parameters(job.weights).mpc.integral
+        if job.weights is not self.job.weights and not any(integral[:-1]):
+            self._stepper.forget_disturbance()  # it would stay as other weights left it
         self.job = job
         self._stepper.set_job(job)
 

@@ -22,6 +22,7 @@ from jaxtyping import Float
 
 from hector_jax.control import controller
 from hector_jax.control.controller import Memory, Plan, WalkConfig
+from hector_jax.control.disturbance import NO_DISTURBANCE
 from hector_jax.control.parameters import Parameters
 from hector_jax.control.reference import Anchor, anchor_at, standing_anchor, with_pieces
 from hector_jax.control.weights import Weights
@@ -254,7 +255,8 @@ class Stepper:
         self.set_job(job)
         of_inputs = layout((self.anchor, clock, memory, yaw, *measured))
         self._packed_anchor, self._state, packed = map(_pack, (self.anchor, state, memory))
-        self._packed, self._memory_size, self._yaw, self._joints = packed, packed.size, yaw, joints
+        self._packed, self._of_memory, self._yaw, self._joints = packed, layout(memory), yaw, joints
+        self._memory_size = packed.size
         self._planner_for = cache(partial(_planner, config, self._of_constants, of_inputs))
         self._sampled = _sampler(config, self._of_constants, of_inputs)
         self._torques_of = partial(_torques, config, self._of_constants)
@@ -268,6 +270,14 @@ class Stepper:
         numbers = _parameters(self.config, job.weights)
         constants = self._body, numbers, command, job.imperfections
         self._of_constants, self._constants = layout(constants), _pack(constants)
+
+    def forget_disturbance(self) -> None:
+        """Empty the memory of the integral action."""
+        packed = np.array(self._packed)
+        memory = unpack(self._of_memory, packed[: self._memory_size])
+        memory = memory._replace(disturbance=NO_DISTURBANCE)
+        leaves = [np.ravel(x) for x in jax.tree.leaves(memory)]
+        self._packed = np.concatenate([*leaves, packed[self._memory_size :]])
 
     def set_anchor(self, anchor: Anchor) -> None:
         """Let the reference start elsewhere."""
