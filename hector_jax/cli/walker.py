@@ -14,9 +14,11 @@ import numpy as np
 from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import Check, Tune, Twin
-from hector_jax.control.controller import walk_config
+from hector_jax.control.controller import WalkConfig, walk_config
+from hector_jax.control.reference import Command
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.twin import TwinConfig
+from hector_jax.control.weights import Weights
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.console import say
 from hector_jax.core.files import write_json
@@ -89,6 +91,10 @@ def run_twin(args: Twin) -> None:
     print_result(args.json, result, lambda: print(*lines, sep="\n"))
 
 
+_Inputs = tuple[WalkConfig, Robot, Weights, Command]
+"""Controller, robot, weights and command of a log."""
+
+
 class _Compared(NamedTuple):
     """What `hector log twin` finds."""
 
@@ -99,7 +105,7 @@ class _Compared(NamedTuple):
 
 
 def _by_planner(
-    planner: Program, read: Callable[[TwinConfig], tuple[Trajectory, str]], inputs: tuple
+    planner: Program, read: Callable[[TwinConfig], tuple[Trajectory, str]], inputs: _Inputs
 ) -> _Compared:
     """Compare a log with the plans of a program."""
     config, robot, *_ = inputs
@@ -110,7 +116,7 @@ def _by_planner(
     return _Compared(calls.parity, end, calls)
 
 
-def _by_twin(read: Callable[[TwinConfig], tuple[Trajectory, str]], inputs: tuple) -> _Compared:
+def _by_twin(read: Callable[[TwinConfig], tuple[Trajectory, str]], inputs: _Inputs) -> _Compared:
     """Compare a log with the plans of a twin, and look for conventions by which they fit."""
     config, robot, *_ = inputs
     as_is, fit = find_conventions(lambda twin: read(twin)[0], *inputs)
