@@ -329,9 +329,8 @@ def _source(kind: Any) -> PathKind | None:
 
 def _check_source(label: str, value: Path | str, source: PathKind) -> None:
     """Check that a flag names a file or folder of its source that exists; else InputError."""
-    text = str(value)
-    if source in (PathKind.SETS, PathKind.LOG):
-        _, text = named_file(text)
+    is_named = source in (PathKind.SETS, PathKind.LOG)
+    text = named_file(str(value))[1] if is_named else str(value)
     path, named, is_dir = Path(text), text in NAMED_WEIGHTS, os.path.isdir(text)
     existing = next(x for x in (path, *path.parents) if os.path.exists(x))
     valid, is_file = {

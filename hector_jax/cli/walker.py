@@ -76,7 +76,7 @@ def run_twin(args: Twin) -> None:
     config, trajectory = walk_config(robot), arguments.load_trajectory(args.traj, robot)
     seconds = arguments.walk_seconds(args, trajectory)
     weights, tick = arguments.weights_by_name(args.weights, robot), config.gait.tick
-    inputs = config, robot, weights, trajectory.command
+    inputs = _Inputs(config, robot, weights, trajectory.command)
     planner = arguments.planner_of(args)
     with arguments.logs_of(args, [args.log], robot, seconds, tick) as (path,):
         read = cache(lambda twin: read_walk(path, robot, seconds, tick, twin=twin))
@@ -91,8 +91,13 @@ def run_twin(args: Twin) -> None:
     print_result(args.json, result, lambda: print(*lines, sep="\n"))
 
 
-_Inputs = tuple[WalkConfig, Robot, Weights, Command]
-"""Controller, robot, weights and command of a log."""
+class _Inputs(NamedTuple):
+    """What a log is compared with."""
+
+    config: WalkConfig
+    robot: Robot
+    weights: Weights
+    command: Command
 
 
 class _Compared(NamedTuple):
@@ -108,21 +113,21 @@ def _by_planner(
     planner: Program, read: Callable[[TwinConfig], tuple[Trajectory, str]], inputs: _Inputs
 ) -> _Compared:
     """Compare a log with the plans of a program."""
-    config, robot, *_ = inputs
+    config, robot, weights, command = inputs
     walk, end = read(config.twin)
     ticks = trajectory_of(at_ticks(log_of(walk), config.gait.tick))
-    asked = plan_inputs(*inputs, ticks)
+    asked = plan_inputs(config, robot, weights, command, ticks)
     calls = compare_calls(partial(call_planner, planner), config, robot, asked, ticks)
     return _Compared(calls.parity, end, calls)
 
 
 def _by_twin(read: Callable[[TwinConfig], tuple[Trajectory, str]], inputs: _Inputs) -> _Compared:
     """Compare a log with the plans of a twin, and look for conventions by which they fit."""
-    config, robot, *_ = inputs
-    as_is, fit = find_conventions(lambda twin: read(twin)[0], *inputs)
+    config, robot, weights, command = inputs
+    as_is, fit = find_conventions(lambda twin: read(twin)[0], config, robot, weights, command)
     readable = bool(np.isfinite(as_is.error))
     walk, end = read(config.twin if readable else fit.twin)
-    parity = compare_plans(*inputs, walk)
+    parity = compare_plans(config, robot, weights, command, walk)
     if not (settings := settings_of(fit, as_is, robot)):
         return _Compared(parity, end)
     before = as_is.error if readable else None

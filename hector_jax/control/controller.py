@@ -1,8 +1,7 @@
 """The whole controller: `plan` computes the wrench, `actuate` converts it into joint torques.
 
-All worlds share it: the rigid-body rollout calls `plan` with the feet of its own state; the MuJoCo
-worlds call `step_plan` and `actuate` with measurements. The controller knows only the nominal
-robot, never the parameters of the plant.
+All worlds share it: the rigid-body rollout calls `plan` with the feet of its own state, the MuJoCo
+worlds `step_plan` and `actuate` with measurements. It knows the nominal robot, never the plant.
 """
 
 from collections.abc import Callable, Iterable

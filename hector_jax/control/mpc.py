@@ -6,11 +6,11 @@ r"""The walking MPC as the smallest QP: cost and constraints of Eq. 3-4 -> stanc
                 F = M = 0                              each foot in the air
 
 States are eliminated. Feet in the air have no variables, nor do wrench components outside the
-contact model. `max_contacts` is the largest number of feet in stance at once; if fewer feet stand,
-the inputs of the others have zero columns and a unit Hessian, so that shapes stay static.
+contact model. If fewer feet stand than `max_contacts`, the inputs of the others have zero columns
+and a unit Hessian, so that shapes stay static.
 
-Differences from the paper: the cost is on x_1..x_N instead of x_0..x_{N-1}, because x_0 is given; a
-foot in the air has no M_z; the reference may be shifted, see `controller`; also `contact`, `twin`.
+Unlike the paper: the cost is on x_1..x_N, because x_0 is given; a foot in the air has no M_z; the
+reference may be shifted, see `controller`; also `contact`, `twin`.
 """
 
 import math

@@ -64,19 +64,7 @@ def read_walk(
     twin = walk_config(robot).twin if twin is None else twin
     walk, valid, wanted = _entries(path, robot, seconds, tick, needed=needed, twin=twin)
     min_height, max_tilt = robot.description.limits
-    tilt = np.abs(walk.state.euler[:valid, :2]).max(axis=1)
-    tilt = np.where(walk.state.position[:valid, 2] >= min_height, tilt, 0.0)  # of an upright trunk
-    tall = walk.state.position[:valid, 2] >= UPRIGHT * float(robot.standing_height)
-    roll, pitch, yaw = np.abs(walk.state.euler[:valid]).max(axis=0, initial=0.0)
-    leans = np.mean(np.abs(walk.state.euler[:valid, 0]) > max_tilt)  # a fall passes it at the end
-    if tall.all() and max(pitch, yaw) < max_tilt and leans > _LEANS:
-        text = f"roll reaches {roll:.3g} at full height and yaw stays small"
-        raise InputError(
-            f"{path}: {text}, expected roll, pitch, yaw: is it yaw, pitch, roll ({YPR})?"
-        )
-    if tilt.max(initial=0.0) > np.pi or (tilt[:1] > max_tilt).any():
-        text = f"roll or pitch reaches {tilt.max():.3g} at full height"
-        raise InputError(f"{path}: {text}, expected radians")
+    _check_angles(path, robot, jax.tree.map(lambda x: x[:valid], walk.state))
     count, period, rows = len(walk.joints), float(walk.period), np.arange(wanted)
     cut = walk._replace(period=None, initial=None)
     samples = jax.tree.map(lambda x: x[np.minimum(rows, valid - 1)], cut)
@@ -94,6 +82,23 @@ def read_walk(
     return samples._replace(
         period=walk.period, initial=walk.initial, state=state, fallen=fallen
     ), end
+
+
+def _check_angles(path: Path, robot: Robot, state: State) -> None:
+    """Raise InputError if the angles of an upright trunk are in another order, or in degrees."""
+    min_height, max_tilt = robot.description.limits
+    tilt = np.abs(state.euler[:, :2]).max(axis=1)
+    tilt = np.where(state.position[:, 2] >= min_height, tilt, 0.0)  # of an upright trunk
+    tall = state.position[:, 2] >= UPRIGHT * float(robot.standing_height)
+    roll, pitch, yaw = np.abs(state.euler).max(axis=0, initial=0.0)
+    leans = np.mean(np.abs(state.euler[:, 0]) > max_tilt)  # a fall passes it at the end
+    if tall.all() and max(pitch, yaw) < max_tilt and leans > _LEANS:
+        text = f"roll reaches {roll:.3g} at full height and yaw stays small"
+        expected = f"expected roll, pitch, yaw: is it yaw, pitch, roll ({YPR})?"
+        raise InputError(f"{path}: {text}, {expected}")
+    if tilt.max(initial=0.0) > np.pi or (tilt[:1] > max_tilt).any():
+        text = f"roll or pitch reaches {tilt.max():.3g} at full height"
+        raise InputError(f"{path}: {text}, expected radians")
 
 
 def read_entries(path: Path, names: Iterable[str]) -> dict[str, np.ndarray]:

@@ -19,8 +19,7 @@
     [weights]                          # each an x, y, z triple or a single number
     nominal, expert = { euler, position, ang_velocity, velocity, force, moment }
     [loss]                             # weights of the loss terms: L_Eul, L_pos, L_ctrl
-    [tuning]                           # fields of TuningSettings
-    [plants]                           # fields of PlantSizes
+    [tuning] [plants]                  # fields of TuningSettings, PlantSizes
     [numbers.NAME]                     # of a user's controller: fields of Number
 
 The model must be named; all other defaults are those of assets/hector.toml,
