@@ -72,7 +72,7 @@ class MujocoPlant(Plant):
     def mean_force(self, steps: int) -> Float[np.ndarray, "feet 3"]:
         """Return the mean force on each foot [N] over the last steps, at most those it notes."""
         rows = self._sensed[np.arange(self._steps - steps, self._steps)]
-        return sensing.sensed_ground(rows, self._feet).force.mean(axis=0)
+        return np.mean(sensing.sensed_ground(rows, self._feet).force, axis=0)
 
     def state(self) -> Float[np.ndarray, " n"]:
         """Return all that the next steps follow from, for `replay`."""
