@@ -217,13 +217,15 @@ class LivePage:
             scene.add_frame(root, show_axes=False, position=(0.0, 1.9 * height * across, 0.0))
             meshes = body_meshes(self._setup.model, colour).items()
             bodies = {b: scene.add_mesh_trimesh(f"{root}/body{b}", mesh) for b, mesh in meshes}
-            label = {"anchor": "bottom-center", "font_screen_scale": 1.4}
+            # a label that moves lags behind: the robots stay near it, while the world moves
+            above = (0.0, 1.9 * height * across, 2.0 * height)
+            label = {"anchor": "bottom-center", "font_screen_scale": 1.4, "position": above}
+            scene.add_label(f"/name{i}", name, **label)
             self._handles.append(
                 {
                     "bodies": bodies,
                     "arrows": [self._add_arrows(f"{root}/{kind}", kind) for kind in _FORCES],
                     "aim": scene.add_icosphere(f"{root}/aim", 0.018, INK),
-                    "name": scene.add_label(f"{root}/name", name, **label),
                 }
             )
 
@@ -269,7 +271,6 @@ class LivePage:
                     end = _ARROW * height / weight * force
                     arrow.points = np.stack([np.zeros(3), end])[None].astype(np.float32)
         handles["aim"].position = now.reference
-        handles["name"].position = now.pose[:3] + [0.0, 0.0, 0.6 * height]
 
     def _show_numbers(self, frame: Frame) -> None:
         slow = frame.wanted > 0.0 and frame.factor < _SLOW * frame.wanted
