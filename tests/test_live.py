@@ -173,7 +173,7 @@ def test_a_page_shows_what_the_walk_is_at_and_turns_undoes_and_saves_weights(mon
     with opened_server("127.0.0.1", 0) as (server, _):
         page = LivePage(server, setup, Wire(found), Tuner(HandsOver(), ROBOT))
         page.show(Frame(*found.frame(), 0.4, 1.0, 0))
-        assert "0.40: **this machine is too slow** for 1" in page._status.content
+        assert "0.40: **this machine is too slow** for speed 1" in page._status.content
         assert "**nominal**: 0.5 s; QP solved; " in page._status.content
         assert re.search(r"(left|right) \d+ N, \d+ % of friction", page._status.content)
         assert "| **nominal** now | " in page._table.content

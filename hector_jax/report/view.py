@@ -261,7 +261,7 @@ class Page:
         height = self._motions[0].height
         camera.look_at = (0.0, 0.0, 0.76 * height)
         camera.position = tuple(height * np.array([3.8 * np.cos(side), 3.8 * np.sin(side), 1.8]))
-        self._world = add_floor(scene)
+        self._world, _ = add_floor(scene)
         self._handles = []
         for i in range(len(self._motions)):
             position = (0.5 - i) * _DISTANCE * height * across

@@ -29,6 +29,8 @@ from hector_jax.sim.world import MAX_DELAY, WORLDS, Imperfections, named_world
 _STRIP = 10.0  # [s] of the errors that are drawn
 _SLOW = 0.95  # share of the wanted speed below which the machine is too slow
 _ARROW = 5 / 6  # length of an arrow for the robot's weight, as a share of its height
+_LOADED = 0.05  # share of the weight on a foot that is worth showing
+_FORCES = {"planned": (25, 25, 30), "measured": (240, 120, 20)}  # colours of arrows
 _SIDES = {"from behind": (1, 0), "from ahead": (-1, 0), "from the right": (0, 1)}
 _SIDES |= {"from the left": (0, -1)}
 
@@ -133,6 +135,7 @@ class LivePage:
 
     def _add_errors(self) -> None:
         gui = self._server.gui
+        gui.add_markdown("Forces of the ground: black as planned, orange as measured.")
         with gui.add_folder(f"Errors, RMS of the last {WINDOW:g} s"):
             self._table = gui.add_markdown("")
             empty = {name: np.full(1, np.nan) for name in self._names}
@@ -161,7 +164,7 @@ class LivePage:
             payload = gui.add_slider("payload on the trunk [kg]", 0.0, 10.0, 0.1, 0.0)
 
             def show(plant: Imperfections) -> None:
-                self._plant, self._floor = plant, friction
+                self._plant = plant
                 mass.value, friction.value = float(plant.mass), float(plant.floor_friction)
                 delay.value = 1e3 * float(plant.delay)
 
@@ -208,47 +211,41 @@ class LivePage:
         camera, side = self._server.initial_camera, np.deg2rad(-50.0)
         camera.look_at = (0.0, 0.0, 0.76 * height)
         camera.position = tuple(height * np.array([3.8 * np.cos(side), 3.8 * np.sin(side), 1.8]))
-        self._world, self._handles = add_floor(scene), []
+        (self._world, self._floor), self._handles = add_floor(scene), []
         for i, (name, colour) in enumerate(zip(self._names, rgb_of(self._names), strict=True)):
             root, across = f"/world/{i}", (len(self._names) - 1) / 2 - i
             scene.add_frame(root, show_axes=False, position=(0.0, 1.9 * height * across, 0.0))
-            radius = 0.019 * height
-            size = {"shaft_radius": radius, "head_radius": 2.3 * radius}
-            size["head_length"] = 0.083 * height
-            points = np.zeros((1, 2, 3), np.float32)
-            self._handles.append({
-                "bodies": {
-                    body: scene.add_mesh_trimesh(f"{root}/body{body}", mesh)
-                    for body, mesh in body_meshes(self._setup.model, colour).items()
-                },
-                "planned": scene.add_arrows(f"{root}/planned", points, (25, 25, 30), **size),
-                "measured": scene.add_arrows(f"{root}/measured", points, (240, 120, 20), **size),
-                "aim": scene.add_icosphere(f"{root}/aim", 0.018, INK),
-                "name": scene.add_label(f"{root}/name", name, anchor="bottom-center"),
-            })  # fmt: skip
+            meshes = body_meshes(self._setup.model, colour).items()
+            bodies = {b: scene.add_mesh_trimesh(f"{root}/body{b}", mesh) for b, mesh in meshes}
+            # a label that moves lags behind: the robots stay near it, while the world moves
+            above = (0.0, 1.9 * height * across, 2.0 * height)
+            label = {"anchor": "bottom-center", "font_screen_scale": 1.4, "position": above}
+            scene.add_label(f"/name{i}", name, **label)
+            self._handles.append(
+                {
+                    "bodies": bodies,
+                    "arrows": [self._add_arrows(f"{root}/{kind}", kind) for kind in _FORCES],
+                    "aim": scene.add_icosphere(f"{root}/aim", 0.018, INK),
+                }
+            )
+
+    def _add_arrows(self, root: str, kind: str) -> list[Any]:
+        """Add an arrow for each foot, that starts at the origin of its own frame."""
+        robot = self._setup.robot
+        height, points = float(robot.standing_height), np.zeros((1, 2, 3), np.float32)
+        radius = 0.019 * height
+        size = {"shaft_radius": radius, "head_radius": 2.3 * radius, "head_length": 0.083 * height}
+        feet = range(len(robot.foot_point))
+        add = self._server.scene.add_arrows
+        return [add(f"{root}{foot}", points, _FORCES[kind], **size) for foot in feet]
 
     def show(self, frame: Frame) -> None:
         """Show a frame; numbers and strips four times a second."""
-        height = float(self._setup.robot.standing_height)
+        aim = frame.walks[0].reference * [1.0, 1.0, 0.0]
         with self._server.atomic():
-            self._world.position = -frame.walks[0].reference * [1.0, 1.0, 0.0]
+            self._world.position, self._floor.position = -aim, 5.0 * np.round(aim / 5.0)
             for now, handles in zip(frame.walks, self._handles, strict=True):
-                self._data.qpos[:] = now.pose
-                mujoco.mj_kinematics(self._setup.model, self._data)
-                for body, handle in handles["bodies"].items():
-                    handle.position = self._data.xpos[body].copy()
-                    handle.wxyz = self._data.xquat[body].copy()
-                scale = (
-                    _ARROW * height / float(self._setup.robot.mass * self._setup.robot.gravity[2])
-                )
-                for kind, force in (("planned", now.planned), ("measured", now.measured)):
-                    ends = np.stack([now.feet, now.feet + scale * force], axis=1)
-                    seen = np.linalg.norm(scale * force, axis=1) > 0.07 * height
-                    handles[kind].visible = bool(seen.any())
-                    if seen.any():
-                        handles[kind].points = ends[seen].astype(np.float32)
-                handles["aim"].position = now.reference
-                handles["name"].position = now.pose[:3] + [0.0, 0.0, 0.6 * height]
+                self._draw(now, handles)
         for strip, now in zip(self._strips, frame.walks, strict=True):
             if not strip or now.time > strip[-1][0]:
                 off = np.hypot(*now.error[:2]), np.hypot(*now.error[3:5])
@@ -259,11 +256,27 @@ class LivePage:
             self._next = time.monotonic() + 0.25
             self._show_numbers(frame)
 
+    def _draw(self, now: Now, handles: dict[str, Any]) -> None:
+        robot = self._setup.robot
+        height, weight = float(robot.standing_height), float(robot.mass * robot.gravity[2])
+        self._data.qpos[:] = now.pose
+        mujoco.mj_kinematics(self._setup.model, self._data)
+        for body, handle in handles["bodies"].items():
+            handle.position = self._data.xpos[body].copy()
+            handle.wxyz = self._data.xquat[body].copy()
+        for arrows, forces in zip(handles["arrows"], (now.planned, now.measured), strict=True):
+            for arrow, foot, force in zip(arrows, now.feet, forces, strict=True):
+                arrow.position, arrow.visible = foot, bool(force[2] > _LOADED * weight)
+                if arrow.visible:
+                    end = _ARROW * height / weight * force
+                    arrow.points = np.stack([np.zeros(3), end])[None].astype(np.float32)
+        handles["aim"].position = now.reference
+
     def _show_numbers(self, frame: Frame) -> None:
         slow = frame.wanted > 0.0 and frame.factor < _SLOW * frame.wanted
         lines = [f"Real-time factor {frame.factor:.2f}" if frame.wanted else "Stopped."]
         if slow:
-            lines[0] += f": **this machine is too slow** for {frame.wanted:g}"
+            lines[0] += f": **this machine is too slow** for speed {frame.wanted:g}"
         rows = ["| | x, y, z [cm] | roll, pitch, yaw [°] |", "|---|---|---|"]
         sets = zip(self._names, frame.walks, frame.starts, strict=True)
         for name, now, first in sets:
@@ -281,9 +294,9 @@ class LivePage:
     def _state_text(self, now: Now) -> str:
         if now.fall:
             return f"{now.fall}. Reset lets it stand again."
-        mu, text = float(self._plant.floor_friction), []
+        mu, robot, text = float(self._plant.floor_friction), self._setup.robot, []
         for foot, force in zip(FEET[len(now.measured)], now.measured, strict=True):
-            if force[2] > 1.0:
+            if force[2] > _LOADED * float(robot.mass * robot.gravity[2]):
                 share = np.abs(force[:2]).sum() / (mu * force[2])  # the cone is a diamond
                 text.append(
                     f"{foot.replace('_', ' ')} {force[2]:.0f} N, {100 * share:.0f} % of friction"

@@ -12,13 +12,12 @@ from hector_jax.report.plots.style import rgb_of
 _DASHES = ([6, 4], [], [2, 3], [10, 3, 2, 3])  # of lines in plots: before, after, further sets
 
 
-def add_floor(scene: Any) -> Any:
-    """Add the frame of all that moves with the world under the camera, and the floor."""
+def add_floor(scene: Any) -> tuple[Any, Any]:
+    """Add the frame of all that moves with the world under the camera, and the floor in it."""
     world = scene.add_frame("/world", show_axes=False)
     colours = {"cell_color": (224, 228, 233), "section_color": (196, 203, 211)}
     colours |= {"plane_color": (241, 243, 246), "plane_opacity": 1.0}
-    scene.add_grid("/world/floor", 30.0, 30.0, **colours)
-    return world
+    return world, scene.add_grid("/world/floor", 30.0, 30.0, **colours)
 
 
 def plot(gui: Any, title: str, x_name: str, x: np.ndarray, lines: Mapping[str, np.ndarray]) -> Any:
