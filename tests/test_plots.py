@@ -153,10 +153,11 @@ def test_films_and_strips_are_written_with_the_promised_size(tmp_path):
     # the plot below is pale where time has not come yet
     first, _, last = (np.sum(np.ptp(picture[324:], axis=-1) > 60) for picture in pictures)
     assert last > first + 20
-    write_film(tmp_path / "film.webp", ROBOT, walks, config)
+    write_film(tmp_path / "film.webp", ROBOT, walks, config, strip=tmp_path / "both.png")
     with Image.open(tmp_path / "film.webp") as picture:
         assert (picture.size, picture.n_frames, picture.info["loop"]) == ((640, 432), 3, 0)
     write_strip(tmp_path / "strip.png", ROBOT, walks, config)
+    assert (tmp_path / "strip.png").read_bytes() == (tmp_path / "both.png").read_bytes()
     with Image.open(tmp_path / "strip.png") as picture:
         assert picture.size == (2 * 192, 2 * 324)
 

@@ -106,16 +106,16 @@ def test_metrics_of_a_run_that_goes_on_are_read_and_its_newest_weights_taken(tmp
 
 def test_a_folder_gets_film_and_pictures_instead(monkeypatch, capsys, tmp_path):
     filmed = []
-    for write in ("write_film", "write_strip"):
-        monkeypatch.setattr(pictures, write, lambda *film: filmed.append(film))
+    instead(monkeypatch, pictures, "write_film", lambda *film, strip: filmed.append((*film, strip)))
     instead(monkeypatch, arguments, "walk_once", lambda *_: pretend_walk(seconds=0.3))
     monkeypatch.setattr(inputs, "find_spec", lambda name: None)  # needs no viser
     run, out = pretend_run(tmp_path / "run"), tmp_path / "out"
     flags = ["--world", "srbm", "--sets", "nominal", "expert"]
     assert call(monkeypatch, "view", run, "--out", out, *flags) == 0
     assert "no net at" in capsys.readouterr().err
-    assert [path.name for path, *_ in filmed] == ["film.mp4", "film.png"]
-    assert list(filmed[0][2]) == ["before: nominal", "after: expert"]
+    [(film, _, shown, strip)] = filmed
+    assert (film.name, strip.name) == ("film.mp4", "film.png")
+    assert list(shown) == ["before: nominal", "after: expert"]
     drawn = {"losses.png", "path.png", "tracking.png", "wrenches.png"}
     assert {file.name for file in out.iterdir()} == drawn
 

@@ -1,7 +1,6 @@
 """The pictures and the film of each command, drawn by plots and video.py."""
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +11,9 @@ from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.grfm.nets import History
 from hector_jax.report import plots
 from hector_jax.report.fidelity import Drift
-from hector_jax.report.motion import Motion, motions
+from hector_jax.report.motion import motions
 from hector_jax.report.report import WORLDS, Picture
-from hector_jax.report.video import VideoUnavailable, write_film, write_strip
+from hector_jax.report.video import VideoUnavailable, write_film
 from hector_jax.report.view import ViewedWalk
 from hector_jax.robot.model import Robot
 from hector_jax.store.run import Histories
@@ -119,15 +118,7 @@ def of_view(
         plots.save_losses(folder / "losses.png", loss, tunings)
     say("making the film")
     pair = motions(robot, plots.style.titled(walks))
-    _write(folder / "film.mp4", robot, pair, folder / "film.png")
-
-
-def _write(path: Path, robot: Robot, pair: Mapping[str, Motion], strip: Path | None) -> None:
-    with ThreadPoolExecutor(1) as background:  # two other processes draw side by side
-        film = background.submit(write_film, path, robot, pair)
-        if strip is not None:
-            write_strip(strip, robot, pair)
-        film.result()
+    write_film(folder / "film.mp4", robot, pair, strip=folder / "film.png")
 
 
 def film(
@@ -140,7 +131,7 @@ def film(
     say("making the film")
     pair = motions(robot, walks)
     try:
-        _write(path, robot, pair, strip)
+        write_film(path, robot, pair, strip=strip)
     except VideoUnavailable as error:
         say(str(error))
         return str(error)

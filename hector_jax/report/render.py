@@ -1,6 +1,6 @@
-"""The child process of a film: draws a `video.Scene` with MuJoCo and writes the film or strip.
+"""The child process of a film: draws each `video.Scene` with MuJoCo and writes the film or strip.
 
-It runs in a folder with `scene.pickle`.
+It runs in a folder with `scenes.pickle`.
 """
 
 import pickle
@@ -31,8 +31,12 @@ _LAST = 1500  # [ms] of the last frame of an animated picture, before it repeats
 
 
 def main() -> None:
-    """Draw scene.pickle of the working directory."""
-    scene: Scene = pickle.loads(Path("scene.pickle").read_bytes())
+    """Draw scenes.pickle of the working directory."""
+    for scene in pickle.loads(Path("scenes.pickle").read_bytes()):
+        _draw(scene)
+
+
+def _draw(scene: Scene) -> None:
     width, height = scene.config.width, scene.config.height
     views = _views(scene, 3 * width // 10 if scene.strip else width // 2, 3 * height // 4)
     if scene.strip:

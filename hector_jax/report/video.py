@@ -34,7 +34,7 @@ from hector_jax.robot.model import Robot, compile_model
 BACK_ENDS = ("egl", "osmesa", "glfw")
 ENDINGS = (".mp4", ".webp", ".gif", ".png")  # all but the first are animated pictures
 
-_TIMEOUT = 300.0  # [s] for a back end to draw the whole film
+_TIMEOUT = 300.0  # [s] for a back end to draw the whole film and its strip
 
 
 class VideoUnavailable(Broken):
@@ -83,7 +83,12 @@ def check_film(path: Path) -> None:
 
 
 def write_film(
-    path: Path, robot: Robot, motions: Mapping[str, Motion], config: VideoConfig | None = None
+    path: Path,
+    robot: Robot,
+    motions: Mapping[str, Motion],
+    config: VideoConfig | None = None,
+    *,
+    strip: Path | None = None,
 ) -> str:
     """Draw two walks side by side, and below them their distance from the reference.
 
@@ -92,6 +97,7 @@ def write_film(
         robot: the body that walked.
         motions: two of one command by set or title, before and after.
         config: size and rate.
+        strip: PNG for their strip of snapshots, see `write_strip`, drawn by the same process.
 
     Returns:
         The back end that drew it.
@@ -104,7 +110,8 @@ def write_film(
             imageio_ffmpeg.get_ffmpeg_exe()
         except RuntimeError as error:
             raise VideoUnavailable(f"no film: no video encoder ({one_line(error)})") from None
-    return _write(make_scene(path, robot, motions, config or VideoConfig(), strip=False), path)
+    files, config = {path: False} | ({strip: True} if strip else {}), config or VideoConfig()
+    return _write({x: make_scene(x, robot, motions, config, strip=y) for x, y in files.items()})
 
 
 def write_strip(
@@ -114,7 +121,7 @@ def write_strip(
 
     Args, returns and raises as `write_film`; the path is that of a PNG, and there may be one walk.
     """
-    return _write(make_scene(path, robot, motions, config or VideoConfig(), strip=True), path)
+    return _write({path: make_scene(path, robot, motions, config or VideoConfig(), strip=True)})
 
 
 def make_scene(
@@ -128,7 +135,7 @@ def make_scene(
     if strip:
         times = _snapshot_times(next(iter(motions.values())), seconds, config.tiles)
     return Scene(
-        file=f"drawn{path.suffix.lower()}",
+        file=f"{'strip' if strip else 'drawn'}{path.suffix.lower()}",
         strip=strip,
         config=config,
         model=compile_model(robot.description),
@@ -147,23 +154,24 @@ def _snapshot_times(motion: Motion, seconds: float, tiles: int) -> Float[np.ndar
     return cycle * (cycles + np.arange(tiles) / tiles)
 
 
-def _write(scene: Scene, path: Path) -> str:
-    """Draw a scene with the first back end that works; return its name."""
+def _write(scenes: Mapping[Path, Scene]) -> str:
+    """Draw scenes in one process with the first back end that works; return its name."""
     with tempfile.TemporaryDirectory(prefix="hector-film-") as name:
         folder, failures = Path(name), []
-        (folder / "scene.pickle").write_bytes(pickle.dumps(scene))
+        (folder / "scenes.pickle").write_bytes(pickle.dumps(list(scenes.values())))
         setting = os.environ.get("MUJOCO_GL")
         for back_end in (setting,) if setting else BACK_ENDS:
             failure = _draw_in_child(folder, back_end)
             if not failure:
-                write_file(path, (folder / scene.file).read_bytes())
+                for path, scene in scenes.items():
+                    write_file(path, (folder / scene.file).read_bytes())
                 return back_end
             failures.append(f"{back_end}: {failure}")
     raise VideoUnavailable(f"no film: MuJoCo cannot draw here ({'; '.join(failures)})")
 
 
 def _draw_in_child(folder: Path, back_end: str) -> str:
-    """Draw scene.pickle of a folder with one back end; return why it failed, or ""."""
+    """Draw scenes.pickle of a folder with one back end; return why it failed, or ""."""
     # the child imports this copy of the package
     paths = [str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {"MUJOCO_GL": back_end, "PYTHONPATH": os.pathsep.join(paths)}
