@@ -74,8 +74,7 @@ class MpcConfig:
     friction: Annotated[float, POSITIVE] = 0.6  # mu; larger than the floor's, the feet slip
     max_force: Annotated[float, POSITIVE] = 500.0  # [N] per foot
     sole_width: Annotated[float, SHARE] = 1.0  # share of a flat sole's half width in the plan
-    # shares of the robot's inertia about the trunk's x, y and z with which the plan turns it
-    inertia_share: tuple[float, ...] = (1.0, 1.0, 1.0)
+    inertia_share: tuple[float, ...] = (1.0, 1.0, 1.0)  # of the robot's, x, y, z, in the plan
     twist: Annotated[float, NOT_NEGATIVE] = 0.03  # [m] M_z per F_z, of the constraint "twist"
     line_friction: bool = True  # False removes LINE_FRICTION from the constraints
     effort_reference: str = "zero"  # cost on u (paper); "gravity": on u minus the weight's share
@@ -92,12 +91,11 @@ class MpcConfig:
     costs: tuple[Cost, ...] = ()  # beside Q and R
 
     def __post_init__(self) -> None:
-        unnamed = not self.constraints or isinstance(self.constraints, _Default)
         share, words = Range(0.0, 1.0, above=True), ("zero", "gravity")
         check(self, position_limit=POSITIVE, effort_reference=words, inertia_share=share)
         if len(got := self.inertia_share) != 3:
             raise InputError(f"MpcConfig.inertia_share must be 3 numbers, got {short_repr(got)}")
-        if unnamed:
+        if not self.constraints or isinstance(self.constraints, _Default):
             object.__setattr__(self, "constraints", _Default(self.contact.constraints))
         if not self.on("inputs"):
             text = "MpcConfig.constraints must have one on the inputs, or feet can pull"
