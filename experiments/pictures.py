@@ -8,6 +8,7 @@
     race          loss by the number of walks, against CMA-ES and Bayesian optimisation
     robots        four robots walking
     page          the browser page of a run (needs Chromium and a run: --run)
+    live          the browser page of a live walk (needs Chromium)
 
 Walks are those of the first plant of the hardware stand-in, which no tuning has read; the robots of
 `robots` walk on the high-fidelity simulator.
@@ -291,21 +292,29 @@ def _still(robot: Robot, weights: Weights, title: str) -> Image.Image:
 
 def draw_page(path: Path, run: Path) -> None:
     """Take a picture of the page of `hector view` on a run."""
+    _take_picture(path, [str(run), "--world", "standin"], "before:", 6.0)
+
+
+def draw_live(path: Path) -> None:
+    """Take a picture of the page of `hector view --live`, after some seconds of walking."""
+    _take_picture(path, ["--live", "--weights", "nominal", "best"], "Real-time factor", 25.0)
+
+
+def _take_picture(path: Path, flags: list[str], words: str, seconds: float) -> None:
+    """Take a picture of the page of `hector view`, so long after it shows these words."""
     sys.path.insert(0, str(ROOT / "tests"))
     from browser import opened  # pyright: ignore[reportMissingImports]
 
-    port = 8765
-    words = [sys.executable, "-m", "hector_jax", "view", str(run), "--port", str(port)]
-    server = subprocess.Popen([*words, "--world", "standin"], stderr=subprocess.PIPE, text=True)
+    line = [sys.executable, "-m", "hector_jax", "view", *flags, "--port", "8765"]
+    server = subprocess.Popen(line, stderr=subprocess.PIPE, text=True)
     try:
         assert server.stderr is not None
-        line = next(line for line in server.stderr if line.startswith("open http"))
-        address = line.split()[1]
+        address = next(x for x in server.stderr if x.startswith("open http")).split()[1]
         with tempfile.TemporaryDirectory() as profile, opened(address, profile, height=960) as tab:
             deadline = time.monotonic() + 240.0
-            while "before:" not in tab.text() and time.monotonic() < deadline:
+            while words not in tab.text() and time.monotonic() < deadline:
                 time.sleep(2.0)
-            time.sleep(6.0)
+            time.sleep(seconds)
             tab.call("Runtime.evaluate", expression=CLOSE_NOTICES)
             time.sleep(2.0)
             Image.fromarray(tab.picture()).save(path, optimize=True)
@@ -338,6 +347,7 @@ PICTURES: dict[str, tuple[Path, Callable[[Path], None] | None]] = {
     "race": (OUT / "race.png", draw_race),
     "robots": (OUT / "robots.png", draw_robots),
     "page": (OUT / "page.png", None),  # takes the run too
+    "live": (OUT / "live.png", draw_live),
 }
 
 

@@ -115,7 +115,7 @@ REFUSED = [  # the whole of what is said, or a part of it
     ("walk --seed", "Missing value for argument '--seed'. Expected 1 values."),
     ("walk --seed 1 --seed 2", "--seed is given twice"),
     ("evaluate --weights nominal nominal", "--weights names 'nominal' twice"),
-    ("view", "Missing from hector view: PATH folder of a run"),
+    ("view", "RUN expects a value, got none; or --live"),
     ("walk --seconds long", "Error parsing --seconds: expected a number, got 'long'"),
     ("walk --world moon", "invalid choice 'moon' for argument '--world'. Expected one of ('"),
     ("walk --robot assets/hector.xml", "hector robot MODEL --out NAME.toml makes one, got"),

@@ -33,7 +33,7 @@ from hector_jax.core.settings import SEED, convert, from_table, read_json, read_
 OVERVIEW = {
     "What you type first": {
         "tune": "tune weights for a trajectory, evaluate them, write a report",
-        "view": "show a run in the browser: hector view latest; or turn weights live: --live",
+        "view": "show a run in the browser: hector view latest; live: --live",
         "export": "write weights, lines for C++, the controller as C: hector export latest",
         "robot": "make the file of your own robot from its MJCF or URDF",
         "walk": "walk once; errors in cm and degrees, and a film with --video",
