@@ -139,7 +139,7 @@ def test_a_bag_has_the_walk_that_was_written(walked, tmp_path, mapping, plugin):
 def test_logs_may_be_bags(bag, walked, mapping, tmp_path, monkeypatch, capsys):
     words = ("--mapping", mapping, "--traj", "c", "--seconds", 1.9)
     assert call(monkeypatch, "log", "check", bag, *words) == 0
-    assert capsys.readouterr().out == "nothing is found that weights could not mend\n"
+    assert capsys.readouterr().out == "nothing is found that weights could not fix\n"
     weak = walked["torque"].copy()
     weak[:, 3] = 1000.0
     other = write(tmp_path / "weak", walked | {"torque": weak})

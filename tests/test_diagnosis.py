@@ -1,4 +1,4 @@
-"""What is told of a walk that goes wrong: why it fell, and what no weights mend."""
+"""What is told of a walk that goes wrong: why it fell, and what no weights fix."""
 
 import json
 import re

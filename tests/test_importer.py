@@ -145,7 +145,7 @@ def test_what_a_file_does_not_have_is_guessed_and_told(monkeypatch, capsys, tmp_
     assert load_robot(out).torque_limit.min() > 0.0
 
 
-MENDED = [  # a note, and changes of the small biped
+FIXED = [  # a note, and changes of the small biped
     (
         "<flag> of <option> not used",
         ("<asset>", '<option><flag sensornoise="enable"/></option><asset>'),
@@ -159,7 +159,7 @@ MENDED = [  # a note, and changes of the small biped
 ]
 
 
-@pytest.mark.parametrize("case", MENDED, ids=lambda case: case[0])
+@pytest.mark.parametrize("case", FIXED, ids=lambda case: case[0])
 def test_what_does_not_matter_is_mended_and_told(tmp_path, case):
     text, *changes = case
     own = propose_robot(edited(tmp_path))
@@ -243,7 +243,7 @@ def test_soles_are_measured_on_the_lowest_facets_of_meshes(monkeypatch, capsys, 
                 np.testing.assert_allclose(sole.contacts, expected.contacts, atol=2e-4)
                 np.testing.assert_allclose(sole.axes, expected.axes, atol=1e-6)
     assert call(monkeypatch, "robot", path) == 0
-    assert "mended   soles measured on sole.msh" in capsys.readouterr().out
+    assert "fixed   soles measured on sole.msh" in capsys.readouterr().out
 
 
 def test_a_file_for_another_robot_names_the_command(tmp_path):
@@ -322,7 +322,7 @@ def test_a_draft_has_what_was_found_and_what_is_to_be_mended(monkeypatch, capsys
     assert call(monkeypatch, "robot", tmp_path / "arm.xml") == 2
     printed, err = capsys.readouterr()
     assert re.search(r"no two legs found, .* by their last joint: one \(1\)", err)
-    assert "# To be mended: " in printed
+    assert "# To be fixed: " in printed
     assert tomllib.loads(printed[printed.index("# Proposed") :])["model"] == "arm.xml"
 
 
@@ -412,10 +412,10 @@ def test_a_draft_stands_beside_the_model_that_it_means(monkeypatch, capsys, tmp_
     path = edited(tmp_path, ("0.004 0.004 0.001", "0 0.004 0.001"))
     assert call(monkeypatch, "robot", path, "--out", draft) == 2
     err = capsys.readouterr().err
-    assert f"the proposal is in {draft}; mend it, then: hector robot {draft}" in err
+    assert f"the proposal is in {draft}; fix it, then: hector robot {draft}" in err
     line = propose_robot(path).wrong[-1]
     assert err.endswith(f"hector: {line}\n")
-    assert f"# To be mended: {line}" in draft.read_text()
+    assert f"# To be fixed: {line}" in draft.read_text()
     assert tomllib.loads(draft.read_text())["model"] == path.name
     # beside another robot's model of this name, the draft would mean that one
     other = tmp_path / "other" / path.name
@@ -481,7 +481,7 @@ def test_a_proposal_is_printed_and_written_once_beside_its_model(monkeypatch, ca
     assert "knees bend backwards" in table
     assert re.search(r"left_hip_yaw, right_hip_yaw +\+z yaw", table)
     assert "feet     line: " in table
-    assert "mended   " in table
+    assert "fixed   " in table
     assert "wrong    nothing" in table
     assert tomllib.loads(text)["joints"]["left"][0] == "left_hip_yaw"
     model, out = edited(tmp_path), tmp_path / "other" / "robot.toml"

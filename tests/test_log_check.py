@@ -1,4 +1,4 @@
-"""What the log of a walk shows that no weight can mend: planted faults, and sound logs."""
+"""What the log of a walk shows that no weight can fix: planted faults, and sound logs."""
 
 import re
 from itertools import combinations

@@ -1,4 +1,4 @@
-"""Robots as published, brought to one form: what is kept, what is mended, what is refused."""
+"""Robots as published, brought to one form: what is kept, what is fixed, what is refused."""
 
 import re
 from dataclasses import replace

@@ -130,7 +130,7 @@ def away(weights, case):
 
 
 def toy_loss(weights, case):
-    """L of a case: a hundredth of it no weights can mend."""
+    """L of a case: a hundredth of it no weights can fix."""
     off = away(weights, case)
     return (case + 1) * 1e6 * (0.01 + off @ off)
 

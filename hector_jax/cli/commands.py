@@ -126,16 +126,16 @@ def run_robot(args: flags.Robot) -> None:
                 wrong.append(str(error))
         files = [x for x in proposal.soles[:1] if x.files]
         measured = [f"soles measured on {', '.join(x.files)}" for x in files]
-        lines += section("mended", [*measured, *changes_of_model(robot)])
+        lines += section("fixed", [*measured, *changes_of_model(robot)])
     if file.suffix == ".toml" and proposal.filled:
         lines += section("left out", [f"{', '.join(proposal.filled)}: HECTOR's, by the rules"])
     print("\n".join([*lines, *section("wrong", [*told, *wrong])]))
     head = f"Proposed by `hector robot {file.name}`; rules: docs/robot-toml.md."
-    comments = [head, *(f"To be mended: {line}" for line in [*told, *wrong] if wrong)]
+    comments = [head, *(f"To be fixed: {line}" for line in [*told, *wrong] if wrong)]
     comments += [f"A guess: {line}" for line in proposal.guesses if not wrong]
     if out is not None:
         _write_robot(out, proposal, comments, file)
-        next_step = "mend it, then: hector robot" if wrong else "walk with it: hector walk --robot"
+        next_step = "fix it, then: hector robot" if wrong else "walk with it: hector walk --robot"
         say(f"the proposal is in {out}; {next_step} {out}")
     elif proposal.filled:
         print(f"\n{as_toml(proposal.table, comments)}", end="")

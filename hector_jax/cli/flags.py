@@ -303,7 +303,7 @@ class Walk(Configured, ForRobot, ByWalker, Printed):
 
 @_command
 class Check(ForRobot, ByMapping, Printed):
-    """Say what in the log of a walk no weights can mend: mass, delay, joints, units and so on.
+    """Say what in the log of a walk no weights can fix: mass, delay, joints, units and so on.
 
     Example: hector log check mine.npz --traj straight
     """

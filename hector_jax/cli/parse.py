@@ -40,7 +40,7 @@ OVERVIEW = {
         "evaluate": "compare weight sets on simulated robots and engines; or finished runs",
     },
     "Tune on the walks of a robot, or of a simulator elsewhere": {
-        "log check": "what of the log of a walk no weights can mend",
+        "log check": "what of the log of a walk no weights can fix",
         "log twin": "how far the plans of a robot's file are from those of a log",
         "log foretell": "what other weights would bring on the robot of a log",
         "propose": "the weights to walk with next",

@@ -44,7 +44,7 @@ _CALL_FLAGS = ("config", "out", "resume")
 _FREE_FLAGS = (
     *("cluster", "data", "json", "processes", "video"),
     *("walker", "walker_limit", "walker_uses"),  # the record of its walks tells what it is
-    "planner",  # of which walks do not depend: it may be mended in between
+    "planner",  # of which walks do not depend: it may be fixed in between
 )
 # flags that say nothing to a program of the user
 _OF_OUR_CONTROLLER = "alpha data iterations net safe smooth variant".split()

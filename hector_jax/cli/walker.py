@@ -56,7 +56,7 @@ from hector_jax.walk_tuning.walks import WalkTuning, tune_on_walks
 
 
 def run_check(args: Check) -> None:
-    """Say what of a log no weights can mend."""
+    """Say what of a log no weights can fix."""
     robot = load_robot(args.robot)
     trajectory = arguments.load_trajectory(args.traj, robot)
     seconds, config = arguments.walk_seconds(args, trajectory), walk_config(robot)
@@ -66,7 +66,7 @@ def run_check(args: Check) -> None:
     lines = [*([end] if end else []), *check_log(log, config.plan_interval)]
     if note := unasked(log):
         say(note)
-    text = "\n".join(lines or ["nothing is found that weights could not mend"])
+    text = "\n".join(lines or ["nothing is found that weights could not fix"])
     print_result(args.json, {"found": lines}, lambda: print(text))
 
 
@@ -322,7 +322,7 @@ def _say_cost(args: Tune, campaign: Campaign, first: _First) -> None:
 
 
 def _check_first(args: Tune, campaign: Campaign) -> _First:
-    """Walk once with the weights at the start, and say what no weights can mend.
+    """Walk once with the weights at the start, and say what no weights can fix.
 
     Another walk, on another plant, tells whether the program takes plants.
     """

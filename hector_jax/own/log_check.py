@@ -1,4 +1,4 @@
-"""Is it the weights? What the log of a walk shows that no weight can mend.
+"""Is it the weights? What the log of a walk shows that no weight can fix.
 
 The log may be of any controller on any robot or simulator (`walk_file`). Each question has a line
 with a figure where the answer is bad. Questions whose entries the log does not have are not asked.
@@ -114,7 +114,7 @@ def read_check(
 
 
 def check_log(log: CheckedLog, tick: float) -> list[str]:
-    """Return a line for each fault that no weight can mend, what to look at first in front.
+    """Return a line for each fault that no weight can fix, what to look at first in front.
 
     Args:
         log: of `read_check`.

@@ -5,7 +5,7 @@ never opened. A body whose mass comes from a mesh, and a coupling of leg joints,
 
 CAD programs export frames of no mass, whose inertia is rounding: a body of at most MASSLESS has
 none, and a heavier one that is fixed to its parent is a point mass if no body can have its inertia.
-Of a light link that moves such moments are mended, and a note says so.
+Of a light link that moves such moments are fixed, and a note says so.
 
 Bodies and joints without a name get one, by which descriptions and messages mean them.
 """
@@ -26,7 +26,7 @@ from hector_jax.robot.mjcf import mujoco_errors, text_of
 _GEOM = mujoco.mjtGeom
 MESHES = (_GEOM.mjGEOM_MESH, _GEOM.mjGEOM_SDF, _GEOM.mjGEOM_HFIELD)
 _NO_INERTIA = 1e-12  # [kg m^2], which MuJoCo accepts of any body
-_LIGHT, _LIGHTEST = 0.1, 0.02  # shares of the mass up to which moments are mended, see `_mended`
+_LIGHT, _LIGHTEST = 0.1, 0.02  # shares of the mass up to which moments are fixed, see `_repaired`
 _NONE = 1e-6  # [m^2] of moments of inertia by mass that are no more than rounding
 _DENSITY = 1000.0  # [kg/m^3] of the ball whose moments such a link gets
 _COUPLINGS = ("equality", "tendon")
@@ -153,7 +153,7 @@ def _add_names(spec: mujoco.MjSpec) -> None:
 
 def _mend_inertias(path: Path, spec: mujoco.MjSpec) -> list[str]:
     """Replace the inertias of bodies that have none, see the module's docstring. Returns a note."""
-    total, mended = sum(body.mass for body in spec.bodies[1:] if body.explicitinertial), []
+    total, fixed = sum(body.mass for body in spec.bodies[1:] if body.explicitinertial), []
     for body in spec.bodies[1:]:
         xx, yy, zz, xy, xz, yz = [*body.inertia] + [0.0] * 3
         if np.isfinite(body.fullinertia[0]):
@@ -166,18 +166,18 @@ def _mend_inertias(path: Path, spec: mujoco.MjSpec) -> list[str]:
             continue
         value: float | None = _NO_INERTIA
         if body.mass > MASSLESS and not fixed:
-            value = _mended(moments, body.mass, body.mass / total)
+            value = _repaired(moments, body.mass, body.mass / total)
             text = f"body {body.name!r} has moments of inertia from {least:.3g} to {most:.3g}"
             expect(path, value or least > 0.0, f"{text}, expected positive ones")
             if value is None:  # MuJoCo says what to write, or the file has written it
                 continue
-            mended.append(body.name)
+            fixed.append(body.name)
         body.fullinertia, body.inertia = np.full(6, np.nan), np.full(3, value)
     text = "moments of inertia that no body has are the mean of the three, or a ball's: "
-    return [text + listed(mended)] * bool(mended)
+    return [text + listed(fixed)] * bool(fixed)
 
 
-def _mended(moments: Float[np.ndarray, "3"], mass: float, share: float) -> float | None:
+def _repaired(moments: Float[np.ndarray, "3"], mass: float, share: float) -> float | None:
     """Return a moment of inertia in the place of impossible ones; None of a link that matters."""
     if moments[2] <= _NONE * mass:
         return 0.4 * mass * (0.75 * mass / (np.pi * _DENSITY)) ** (2 / 3)

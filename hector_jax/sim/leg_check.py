@@ -37,7 +37,7 @@ class Stand(NamedTuple):
 
 
 class LogChange(NamedTuple):
-    """A change of the log; `{}` in its words is for the joints of the feet that it mends."""
+    """A change of the log; `{}` in its words is for the joints of the feet that it fixes."""
 
     words: str
     feet: Bool[np.ndarray, " feet"]  # that it changes
@@ -190,8 +190,8 @@ def _rms(x: np.ndarray) -> float:
     return float(np.sqrt(np.mean(x**2)))
 
 
-def _mended(guess: LogChange, as_is: Stand, known: np.ndarray) -> np.ndarray:
-    """Return the feet that a guess mends; none if it is not much better."""
+def _repaired(guess: LogChange, as_is: Stand, known: np.ndarray) -> np.ndarray:
+    """Return the feet that a guess fixes; none if it is not much better."""
     feet = guess.feet & known
     if guess.joints:
         feet = feet & (guess.stand.error < BETTER * as_is.error)
@@ -201,7 +201,7 @@ def _mended(guess: LogChange, as_is: Stand, known: np.ndarray) -> np.ndarray:
 
 
 def _told(guess: LogChange, robot: Robot, feet: np.ndarray) -> str:
-    """Return the words of a guess for the feet that it mends."""
+    """Return the words of a guess for the feet that it fixes."""
     names, count = robot.description.joints, robot.description.leg_joints
     legs = [0] if feet.all() else np.flatnonzero(feet)
     if len(guess.joints) == count and count > 2:
@@ -264,15 +264,15 @@ def legs_found(robot: Robot, walk: Trajectory, stance: Bool[np.ndarray, "n feet"
     if (as_is.error[known] > UNSTEADY).any():
         guesses = [x for ask in (_in_a_leg, _of_legs, _of_time_and_angles) for x in ask(log)]
     while (as_is.error[known] > UNSTEADY).any():
-        mends = [_mended(guess, as_is, known) for guess in guesses]
+        fixes = [_repaired(guess, as_is, known) for guess in guesses]
         costs = [
             _rms(np.where(feet, guess.stand.error, as_is.error)[known]) if feet.any() else np.inf
-            for guess, feet in zip(guesses, mends, strict=True)
+            for guess, feet in zip(guesses, fixes, strict=True)
         ]
         best = int(np.argmin(costs))
         if not np.isfinite(costs[best]):
             break
-        feet = mends[best]
+        feet = fixes[best]
         slide, off = as_is.slide[feet].max(), 100 * np.abs(as_is.height[feet]).max()
         yield (
             f"{where(feet)} slide at {slide:.2f} m/s, {off:.1f} cm off the floor: "

@@ -75,7 +75,7 @@ def read_logged(
         robot, command: that walked, and what was asked of it.
 
     Raises:
-        InputError: it has faults that no weight can mend, so that it foretells nothing; or it fell.
+        InputError: it has faults that no weight can fix, so that it foretells nothing; or it fell.
     """
     controller = config.rollout.walk
     tick, seconds = controller.gait.tick, config.rollout.ticks * controller.gait.tick
