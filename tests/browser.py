@@ -38,8 +38,7 @@ class Tab:
 
     def text(self):
         """All words on the page."""
-        found = self.call("Runtime.evaluate", expression="document.body.innerText")
-        return found["result"]["value"]
+        return self.run("document.body ? document.body.innerText : ''")  # a new page has none yet
 
     def run(self, script):
         """What a line of the browser's language gives."""

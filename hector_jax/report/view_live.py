@@ -192,7 +192,7 @@ class LivePage:
 
     def _ask(self, what: str) -> None:
         self._wanted = what, self._weights.chosen
-        self._found.content = "computing ..."
+        self._found.content = "computing, the first time on a machine for a minute ..."
         self._send("log", self._wanted[1])
 
     def tune(self, walked: Walked | str) -> None:
