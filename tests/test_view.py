@@ -202,7 +202,7 @@ def test_a_browser_shows_the_run_until_it_is_interrupted(tmp_path):
             with opened(told.split()[1], tmp_path / "profile") as tab:
                 until(300, lambda: shows_both(tab.picture()))
                 words = tab.text()
-                for expected in ("before: expert", "after: with", "Pause", "L on the model"):
+                for expected in ("before: expert", "after: with", "Pause", "loss on the model"):
                     assert expected in words
                 write_metrics(run, 20)  # the run goes on
                 until(60, lambda: "with: iteration 20" in tab.text())
