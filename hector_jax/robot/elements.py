@@ -153,7 +153,7 @@ def _add_names(spec: mujoco.MjSpec) -> None:
 
 def _mend_inertias(path: Path, spec: mujoco.MjSpec) -> list[str]:
     """Replace the inertias of bodies that have none, see the module's docstring. Returns a note."""
-    total, fixed = sum(body.mass for body in spec.bodies[1:] if body.explicitinertial), []
+    total, changed = sum(body.mass for body in spec.bodies[1:] if body.explicitinertial), []
     for body in spec.bodies[1:]:
         xx, yy, zz, xy, xz, yz = [*body.inertia] + [0.0] * 3
         if np.isfinite(body.fullinertia[0]):
@@ -171,10 +171,10 @@ def _mend_inertias(path: Path, spec: mujoco.MjSpec) -> list[str]:
             expect(path, value or least > 0.0, f"{text}, expected positive ones")
             if value is None:  # MuJoCo says what to write, or the file has written it
                 continue
-            fixed.append(body.name)
+            changed.append(body.name)
         body.fullinertia, body.inertia = np.full(6, np.nan), np.full(3, value)
     text = "moments of inertia that no body has are the mean of the three, or a ball's: "
-    return [text + listed(fixed)] * bool(fixed)
+    return [text + listed(changed)] * bool(changed)
 
 
 def _repaired(moments: Float[np.ndarray, "3"], mass: float, share: float) -> float | None:
