@@ -113,7 +113,7 @@ def test_commands_of_a_page_parse_and_what_it_names_is_there(path, capsys):
 
 PACKAGE = ROOT / "hector_jax"
 FOREIGN = {"help", "help-all", "no-NAME", "tyro-print-completion"}
-FOREIGN |= {"nworkers", "nthreads", "inplace", "xla"}
+FOREIGN |= {"nworkers", "nthreads", "inplace", "xla", "param-file", "paths"}
 TABLES = {
     "feet",
     "joints",
