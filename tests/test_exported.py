@@ -223,7 +223,7 @@ def held(tmp_path_factory):
     if not libraries:
         pytest.skip("this MuJoCo has no libmujoco.so")
     for file, text in source_of(best()).items():
-        (folder / file).write_text(text)
+        write_file(folder / file, text.encode())
     words = ["cc", "-std=c99", "-O2", f"-I{home}/include", "-I.", HERE / "exported_held.c"]
     words += ["controller.c", *libraries, f"-Wl,-rpath,{home}", "-lm", "-o", "held"]
     subprocess.run(words, cwd=folder, check=True)

@@ -25,7 +25,7 @@ A, B = Path("a"), Path("b")
         ("evaluate --json --first_seed=3 --weights nominal a.json", EVALUATED),
         ("evaluate --json --runs a b", Evaluate(runs=(A, B), json=True)),
         ("tune --no-video", Tune(video=False)),
-        ("view a --sets a b --seconds 2", flags.View(A, sets=("a", "b"), seconds=2.0)),
+        ("view a --sets a b --seconds 2", flags.View((A,), sets=("a", "b"), seconds=2.0)),
         ("export --set without a --json", flags.Export(A, set="without", json=True)),
         ("walk --out=-dash.npz", Walk(out=Path("-dash.npz"))),
     ],
@@ -87,8 +87,9 @@ def test_latest_is_the_tuning_that_began_last(monkeypatch, capsys, tmp_path):
         write_json(tmp_path / "runs" / name / "config.json", config)
         write_json(tmp_path / "runs" / name / "versions.json", {})
     write_json(tmp_path / "runs" / "robot" / "config.json", {"flags": {}})
-    for words in (["view", "latest"], ["export", "latest"]):
-        assert parse.resolve_latest(from_line(words)).run == Path("runs/strider/s/2")
+    last_run = Path("runs/strider/s/2")
+    assert parse.resolve_latest(from_line(["view", "latest"])).run == (last_run,)
+    assert parse.resolve_latest(from_line(["export", "latest"])).run == last_run
     found = parse.resolve_latest(from_line(["evaluate", "--runs", "runs/c/1", "latest"]))
     assert found.runs == (Path("runs/c/1"), Path("runs/strider/s/2"))
     assert "latest is runs/strider/s/2\n" in capsys.readouterr().err

@@ -91,11 +91,12 @@ class MpcConfig:
     costs: tuple[Cost, ...] = ()  # beside Q and R
 
     def __post_init__(self) -> None:
+        unnamed = not self.constraints or isinstance(self.constraints, _Default)
         share, words = Range(0.0, 1.0, above=True), ("zero", "gravity")
         check(self, position_limit=POSITIVE, effort_reference=words, inertia_share=share)
         if len(got := self.inertia_share) != 3:
             raise InputError(f"MpcConfig.inertia_share must be 3 numbers, got {short_repr(got)}")
-        if not self.constraints or isinstance(self.constraints, _Default):
+        if unnamed:
             object.__setattr__(self, "constraints", _Default(self.contact.constraints))
         if not self.on("inputs"):
             text = "MpcConfig.constraints must have one on the inputs, or feet can pull"
@@ -107,10 +108,9 @@ class MpcConfig:
         integral = IntegralGains(*(getattr(self, name) for name in names))
         limit = math.inf if self.position_limit is None else self.position_limit
         costs = {str(cost): 1.0 for cost in self.costs}
-        gravity = float(self.effort_reference == "gravity")
-        return MpcParameters(
-            weights, self.friction, self.max_force, gravity, limit, self.yaw_limit, integral, costs
-        )
+        bounds = self.friction, self.max_force
+        share = float(self.effort_reference == "gravity")
+        return MpcParameters(weights, *bounds, share, limit, self.yaw_limit, integral, costs)
 
     def planned_inertia(self, inertia: Float[Any, "3 3"]) -> Float[Any, "3 3"]:
         """Return the inertia [kg m^2] that the plan turns, from that of the whole robot."""

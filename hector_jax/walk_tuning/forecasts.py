@@ -69,11 +69,11 @@ def walked_next(
 
     Args:
         before, after: the walks without and with its logs.
-        names: the trajectories; a fall is infinite.
+        names: the trajectories; a fall is infinite, and where the best set fell nothing is told.
     """
     number, best = len(before.tuning.sets), before.tuning.best
     sets = after.tuning.sets
     if number >= len(sets):
         return {}
-    ratios = np.log(sets[number].losses) - np.log(sets[best].losses)
-    return dict(zip(names, ratios.tolist(), strict=True))
+    each = zip(names, sets[number].losses, sets[best].losses, strict=True)
+    return {name: float(np.log(x / base)) for name, x, base in each if np.isfinite(base)}
