@@ -96,7 +96,7 @@ def test_latest_is_the_tuning_that_began_last(monkeypatch, capsys, tmp_path):
     found = parse.resolve_latest(from_line(["tune", "--resume", "latest"]))
     assert found == Tune(resume=Path("runs/refused"))  # perhaps it was cut
     (tmp_path / "latest").mkdir()  # one that is there under that name is meant
-    assert parse.resolve_latest(from_line(["view", "latest"])).run == Path("latest")
+    assert parse.resolve_latest(from_line(["view", "latest"])).run == (Path("latest"),)
 
 
 def test_a_path_with_an_equals_sign_is_a_file_where_there_is_one(monkeypatch, tmp_path):
