@@ -118,6 +118,9 @@ A_WALK = "hector walk --weights nominal --traj {} --seconds 1.5 --out {}.npz"
 INPUTS = {
     "hector log add runs/robot log.npz": [PROPOSED, PROPOSED_WALK.format("log.npz")],
     "hector log add runs/robot s.npz": [PROPOSED, PROPOSED_WALK.format("s.npz")],
+    "hector log check log.npz --robot mine.toml": [
+        "hector walk --walker mine.py --robot mine.toml --out log.npz"
+    ],
     "hector log check mine.npz --traj straight": [A_WALK.format("straight", "mine")],
     "hector log foretell mine.npz --walked nominal --weights expert best": [
         A_WALK.format("straight", "mine")
