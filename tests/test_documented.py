@@ -35,7 +35,8 @@ SMALL = {
 """Flags that make a line of a command small, in the place of its own."""
 SECONDS = {"walk": 0.2, "evaluate": 0.2, "check": 1.5, "twin": 1.5, "foretell": 1.5}
 """Lengths of the walks of a command; those of others are as long as a trajectory's file says."""
-ELSEWHERE = ("--cluster", "--help", "doctor")  # a scheduler; no work; the machine's
+# a scheduler; no work; the machine's; of test_live.py and of test_bag.py
+ELSEWHERE = ("--cluster", "--help", "doctor", "--live", "--mapping")
 
 
 def words_of(line):

@@ -115,7 +115,7 @@ def logs_of(
         logs = [Path(folder) / f"{number}-{path.name}.npz" for number, path in enumerate(paths)]
         for path, log in zip(paths, logs, strict=True):
             entries: dict[str, Any] = {**read_bag(path, mapping, robot, seconds, tick)}
-            np.savez(log, **entries)
+            np.savez(log, by_name=np.array(True), **entries)
         try:
             yield logs
         except InputError as error:

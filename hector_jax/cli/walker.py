@@ -24,7 +24,7 @@ from hector_jax.core.console import say
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
-from hector_jax.core.trajectory import FEET, Trajectory
+from hector_jax.core.trajectory import FEET, State, Trajectory
 from hector_jax.own.conventions import find_conventions, lines_of, settings_of
 from hector_jax.own.log_check import check_log, read_check, unasked
 from hector_jax.own.parity import COMPONENTS, Parity, compare_plans
@@ -37,7 +37,7 @@ from hector_jax.own.planner import (
     plan_inputs,
 )
 from hector_jax.own.program import Program, program_of
-from hector_jax.own.walk_file import read_walk
+from hector_jax.own.walk_file import read_entries, read_walk
 from hector_jax.own.walk_log import at_ticks, log_of, trajectory_of
 from hector_jax.own.walker import write_log
 from hector_jax.report.report import first_lines, print_tables
@@ -80,7 +80,10 @@ def run_twin(args: Twin) -> None:
     planner = arguments.planner_of(args)
     with arguments.logs_of(args, [args.log], robot, seconds, tick) as (path,):
         read = cache(lambda twin: read_walk(path, robot, seconds, tick, twin=twin))
-        found = _by_planner(planner, read, inputs) if planner else _by_twin(read, inputs)
+        if planner:
+            found = _by_planner(planner, read, inputs)
+        else:
+            found = _by_twin(read, inputs, ours="card" in read_entries(path, ["card"]))
     result = _parity_result(found.parity)
     result |= {"ended": found.ended, "conventions": found.conventions}
     end = [found.ended] if found.ended else []
@@ -121,9 +124,17 @@ def _by_planner(
     return _Compared(calls.parity, end, calls)
 
 
-def _by_twin(read: Callable[[TwinConfig], tuple[Trajectory, str]], inputs: _Inputs) -> _Compared:
-    """Compare a log with the plans of a twin, and look for conventions by which they fit."""
+def _by_twin(
+    read: Callable[[TwinConfig], tuple[Trajectory, str]], inputs: _Inputs, *, ours: bool
+) -> _Compared:
+    """Compare a log with the plans of a twin, and look for conventions by which they fit.
+
+    `ours`: `hector walk` wrote the log, whose conventions are those of this project.
+    """
     config, robot, weights, command = inputs
+    if ours:
+        walk, end = read(config.twin)
+        return _Compared(compare_plans(config, robot, weights, command, walk), end)
     as_is, fit = find_conventions(lambda twin: read(twin)[0], config, robot, weights, command)
     readable = bool(np.isfinite(as_is.error))
     walk, end = read(config.twin if readable else fit.twin)
@@ -359,9 +370,7 @@ def _check_first(args: Tune, campaign: Campaign) -> _First:
 
 def _same_states(*paths: Path) -> bool:
     """Return whether the states in two logs are the same."""
-    one, other = (
-        {name: x for name, x in np.load(path).items() if name.startswith("state.")}
-        for path in paths
-    )
+    names = [f"state.{name}" for name in State._fields]
+    one, other = (read_entries(path, names) for path in paths)
     same = one.keys() == other.keys()
     return same and all(np.array_equal(x, other[name], equal_nan=True) for name, x in one.items())

@@ -155,7 +155,7 @@ class TwinConfig:
     heel: float | None = None
     # times R: 2 or 0.5 where a cost has halves, the step [s] or 1 over it where it is by the second
     input_cost: Annotated[float, POSITIVE] = 1.0
-    # conventions of its logs (`own.walk_file`), and of the plans that a program answers
+    # conventions of its logs (`own.walk_file`)
     legs: tuple[str, ...] = ()  # order of forces, moments and contacts; empty: that of the robot
     joint_legs: tuple[str, ...] = ()  # order of the joints, likewise
     wrenches: str = "on_robot"  # of the ground on the robot, or of the robot "on_ground"

@@ -91,6 +91,8 @@ def propose_robot(path: Path, weld: Sequence[str] = ()) -> RobotProposal:
     own: dict[str, Any] = {"model": path.name}
     if path.suffix == ".toml":
         own = read_toml(path, "the robot description", MAX_BYTES)
+        if weld:
+            raise InputError(f"--weld is for a model; in {path} write joints.weld")
     file = description_of(path, {"name": "robot", "model": own.get("model", "")}).model
     wrong, error = [], None
     stem = "".join(x if x.isalnum() or x in "-_" else "-" for x in path.stem)

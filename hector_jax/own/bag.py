@@ -79,7 +79,11 @@ class _Bag(NamedTuple):
             raise InputError(f"{self.path}: {unknown('topic', topic, topics)}")
         times, found = [], []
         for connection, recorded, data in self.reader.messages(connections=connections):
-            message = self.reader.deserialize(data, connection.msgtype)
+            try:
+                message = self.reader.deserialize(data, connection.msgtype)
+            except KeyError:
+                text = f"its type {connection.msgtype} is not in the bag"
+                raise InputError(f"{self.path}: {topic}: {text}") from None
             stamp = getattr(getattr(message, "header", None), "stamp", None)
             own = 0 if stamp is None else 1_000_000_000 * stamp.sec + stamp.nanosec
             times.append(own or recorded)
@@ -207,6 +211,8 @@ def _joints(bag: _Bag, mapping: BagMapping, robot: Robot) -> tuple[_Series, _Ser
         order.append(known.index(name))
     if any(list(message.name) != known for message in messages):
         raise InputError(f"{bag.path}: {mapping.joints} has other joints in some messages")
+    if any(len(message.position) != len(known) for message in messages):
+        raise InputError(f"{bag.path}: {mapping.joints} has no position of some joints")
     position = np.array([message.position for message in messages])[:, order]
     efforts = [message.effort for message in messages]
     has_effort = all(len(x) == len(known) for x in efforts)
@@ -258,9 +264,13 @@ def _held(
     """Return what was commanded or planned last, of all legs."""
     legs = len(robot.foot_point)
     each = () if name == "residual" else (legs,) if name == "contact" else (legs, 3)
-    rows = np.concatenate([bag.field(source).last(times) for source in sources], axis=1)
+    fields = [bag.field(source) for source in sources]
+    for field in fields:
+        if field.time[0] > times[-1] or field.time[-1] < times[0]:
+            text = "has no message during the walk: is its clock another?"
+            raise InputError(f"{bag.path}: {field.topic} {text}")
+    rows = np.concatenate([field.last(times) for field in fields], axis=1)
     if rows.shape[1] != (count := int(np.prod(each))):
-        field = name.replace(".", "_")
-        text = f"{field} has {rows.shape[1]} numbers, expected {count}"
+        text = f"{name.replace('.', '_')} has {rows.shape[1]} numbers, expected {count}"
         raise InputError(f"{bag.path}: {text}")
     return rows.reshape(len(times), *each)

@@ -13,12 +13,13 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import Command
 from hector_jax.core.geometry import euler_rates, rotation_from_euler
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import SOLVED, State, Trajectory
 from hector_jax.own.timing import STAMPS, Stamps, read_stamps, timing_faults
-from hector_jax.own.walk_file import check_legs, read_entries, read_walk, reference_of
+from hector_jax.own.walk_file import check_legs, leg_order, read_entries, read_walk, reference_of
 from hector_jax.robot.model import Robot
 from hector_jax.sim.diagnosis import FALLING, MOST_AT_LIMIT, STEADY, lasting, motors, steady_height
 from hector_jax.sim.leg_check import BETTER, legs_found, samples_of, slope
@@ -76,12 +77,15 @@ def read_check(
     whole, end = read_walk(path, robot, seconds, tick, commanded=False)
     check_legs(whole)
     names = "joints", "torque", "contact", "command.force", "effect.force", "reference.position"
-    rest = read_entries(path, (*names, *STAMPS))
+    rest = read_entries(path, (*names, *STAMPS, "card", "by_name"))
     stamps = read_stamps(path, rest, len(rest["joints"]))
     torque, shape = rest.get("torque"), rest["joints"].shape
     if torque is not None and (torque.shape != shape or torque.dtype.kind not in "iuf"):
         text = f"torque must be numbers of shape {shape}"
         raise InputError(f"{path}: {text}, got {torque.dtype} of shape {torque.shape}")
+    if torque is not None and not {"card", "by_name"} & rest.keys():
+        legs = leg_order(robot, walk_config(robot).twin.joint_legs)
+        torque = torque.reshape(len(torque), len(legs), -1)[:, legs].reshape(shape)
     period, count = float(whole.period), int(np.sum(~whole.fallen))
     rows = slice(round(SETTLED / period), count - round(FALLING / period) * bool(end))
     if rows.stop - rows.start < SHORTEST / period:

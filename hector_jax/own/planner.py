@@ -218,7 +218,10 @@ def _convention(
     for text, other in tried.items():
         if distance <= least:
             break
-        plans = call_rows(call, other, rows)[..., :6]
+        try:
+            plans = call_rows(call, other, rows)[..., :6]
+        except InputError:  # a program may refuse what it is never asked in a walk
+            continue
         if np.isfinite(plans).all():
             more, left = _closest(logged, plans, euler, stands)
             if left < _CLOSER * distance:

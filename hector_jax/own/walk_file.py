@@ -7,6 +7,7 @@ command, and all else zero: no fall, solved plans. Logs of other conventions are
 """
 
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -142,8 +143,10 @@ def _entries(
         of samples that were expected.
     """
     empty = no_samples(len(robot.joint_lower), len(robot.foot_point))
-    arrays = read_entries(path, (*named_leaves(empty), "card"))
+    arrays = read_entries(path, (*named_leaves(empty), "card", "by_name"))
     ours = arrays.pop("card", None) is not None
+    if arrays.pop("by_name", None) is not None:
+        twin = by_name(twin)
     asked = "" if "period" in arrays else "; is period missing?"
     arrays = {"period": np.array(TIME_STEP)} | arrays
     if not _divides(period := arrays["period"], tick):
@@ -193,6 +196,11 @@ def _checked(
             raise InputError(f"{path}: {name} must hold zeros and ones")
         found[name] = found[name].astype(bool if name in FLAGS else float)
     return jax.tree.unflatten(jax.tree.structure(empty), list(found.values()))
+
+
+def by_name(twin: TwinConfig) -> TwinConfig:
+    """Return the conventions of a log whose angles and joints have their names, as in a bag."""
+    return replace(twin, angles=TwinConfig.angles, joint_legs=())
 
 
 def leg_order(robot: Robot, names: tuple[str, ...]) -> list[int]:

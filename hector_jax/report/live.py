@@ -76,7 +76,10 @@ class Session:
         while walk.clock < job.start_tick + BLOCK + 3 and not walk.fall:
             walk.tick()
             walk.now()
-        walk.set_command(job.command)
+        for pending in range(1, BLOCK + 1):  # each number of ticks is a shape of its own
+            for _ in range(pending):
+                walk.tick()
+            walk.set_command(job.command)
         walk.set_job(job)
 
     def tick(self) -> None:
@@ -126,7 +129,8 @@ class Session:
 
     def set_plant(self, plant: Imperfections, payload: float) -> None:
         """Change the numbers of the plant, and what sits on its trunk [kg]."""
-        parts = lambda plant: plant.backlash > 0.0  # noqa: E731
+        # backlash has joints of its own, and the noise of a walk is drawn where it begins
+        parts = lambda x: [bool(x.backlash > 0.0), *map(float, x.estimator)]  # noqa: E731
         old, self._payload = self._jobs[0].imperfections, payload
         self._jobs = [job._replace(imperfections=plant) for job in self._jobs]
         if parts(old) != parts(plant):

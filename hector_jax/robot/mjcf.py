@@ -102,12 +102,22 @@ def _root(path: Path) -> ElementTree.Element:
         raise InputError(f"{path}: malformed XML: {one_line(error)}") from None
 
 
-def _include(path: Path, root: ElementTree.Element) -> None:
+def model_bytes(path: Path) -> bytes:
+    """Return the bytes of a model's file, and of those that it includes."""
+    content = path.read_bytes()
+    if b"<include" not in content:
+        return content
+    files = _include(path, _root(path))
+    return b"".join([content, *(file.read_bytes() for file in files)])
+
+
+def _include(path: Path, root: ElementTree.Element) -> list[Path]:
     """Put the content of the files that an MJCF includes into it; they may be beside or below it.
 
-    As in MuJoCo, each file can be included once, and its name is relative to the model.
+    As in MuJoCo, each file can be included once, and its name is relative to the model. Returns the
+    files.
     """
-    folder, seen = path.parent.resolve(), {path.resolve()}
+    folder, seen = path.parent.resolve(), [path.resolve()]
     while found := [(p, x) for p in root.iter() for x in p if x.tag == "include"]:
         for parent, element in found:
             name = element.get("file", "")
@@ -116,9 +126,10 @@ def _include(path: Path, root: ElementTree.Element) -> None:
             text += "model, or below it, that is included once"
             expect(path, file.is_relative_to(folder) and file.is_file() and file not in seen, text)
             expect(path, len(seen) <= _MOST_INCLUDES, f"more than {_MOST_INCLUDES} includes")
-            seen.add(file)
+            seen.append(file)
             i = list(parent).index(element)
             parent[i : i + 1] = list(_root(file))
+    return seen[1:]
 
 
 @contextmanager
