@@ -243,7 +243,7 @@ def test_soles_are_measured_on_the_lowest_facets_of_meshes(monkeypatch, capsys, 
                 np.testing.assert_allclose(sole.contacts, expected.contacts, atol=2e-4)
                 np.testing.assert_allclose(sole.axes, expected.axes, atol=1e-6)
     assert call(monkeypatch, "robot", path) == 0
-    assert "fixed   soles measured on sole.msh" in capsys.readouterr().out
+    assert "fixed    soles measured on sole.msh" in capsys.readouterr().out
 
 
 def test_a_file_for_another_robot_names_the_command(tmp_path):
