@@ -119,6 +119,7 @@ A_WALK = "hector walk --weights nominal --traj {} --seconds 1.5 --out {}.npz"
 INPUTS = {
     "hector log add runs/robot log.npz": [PROPOSED, PROPOSED_WALK.format("log.npz")],
     "hector log add runs/robot s.npz": [PROPOSED, PROPOSED_WALK.format("s.npz")],
+    "hector export runs/c/TIME --set without": ["hector tune --traj c"],
     "hector log check log.npz --robot mine.toml": [
         "hector walk --walker mine.py --robot mine.toml --out log.npz"
     ],
