@@ -596,12 +596,12 @@ def other_pages():
     text = "{refused} of {logs} logs were refused; of the".format(**cases["refused"]["shifted"])
     yield DOCS / "howto" / "walks.md", f"{text} {len(shifted)} forecasts by the others {held} held"
     off = [x["walked"]["L"] - x["foretold"]["L"] for x in cases["pairs"] if x["robot"] == "own"]
-    close = sum(abs(x) < 0.04 for x in off)
+    close = sum(abs(x) < 0.12 for x in off)
     text = (
         f"Of {len(off)} forecasts for the [planner](own.md#the-planner) of the example {close} were"
     )
     yield DOCS / "howto" / "walks.md", text
-    assert {round(np.exp(x)) for x in off if abs(x) > 0.04} == {5}
+    assert [round(np.exp(x)) for x in sorted(off)[close:]] == [2, 5, 5]
     carried = foretell.carry(pretend_verdict(8), "with")
     text = f"held {carried.held} of {carried.walks} walks of the other set"
     yield DOCS / "howto" / "walks.md", text
