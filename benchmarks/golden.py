@@ -283,7 +283,8 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", choices=SECTIONS, help="sections; all by default")
     flags = parser.parse_args()
     names = flags.only or list(SECTIONS)
-    # jaxlib 0.10.2 can hang where XLA's threads begin two batches of factorisations at once
+    # jaxlib 0.10.2 can hang where XLA's threads begin two batches of factorisations at once; a
+    # small program hangs with this flag too, so it is no proof against it
     one_thread = "--xla_cpu_multi_thread_eigen=false"
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {one_thread}"
     setup_jax()

@@ -12,6 +12,7 @@ from published import HOLD, JOINTS, LINK, MOTOR, by_numbers, replaced, small, ur
 
 from hector_jax import InputError, walk_config
 from hector_jax.robot.description import MODEL_PATH, Foot
+from hector_jax.robot.mjcf import model_bytes
 from hector_jax.robot.model import compile_model, describe, load_robot, robot_of
 
 TEXT = MODEL_PATH.read_text()
@@ -264,3 +265,18 @@ def test_a_flag_is_a_word_and_no_number(tmp_path):
     text = swap('ls_iterations="10"/>', 'ls_iterations="10"><flag frictionloss="enable"/></option>')
     (tmp_path / "robot.xml").write_text(text)
     compile_model(describe(tmp_path / "robot.xml"))
+
+
+def test_the_bytes_of_a_model_are_those_of_what_it_includes_too(tmp_path):
+    """So that a hash of it changes where an included file does."""
+    path, part = tmp_path / "robot.xml", tmp_path / "part.xml"
+    path.write_text('<mujoco><include file="part.xml"/></mujoco>')
+    found = []
+    for damping in (0.1, 7.0):
+        part.write_text(
+            f'<mujocoinclude><default><joint damping="{damping}"/></default></mujocoinclude>'
+        )
+        found.append(model_bytes(path))
+    assert found[0] != found[1]
+    path.write_text("<mujoco/>")
+    assert model_bytes(path) == b"<mujoco/>"

@@ -274,8 +274,14 @@ def trajectories_by_name(texts: Sequence[str]) -> dict[str, str]:
     return names
 
 
-def load_trajectories(texts: Sequence[str], robot: Robot) -> tuple[NamedCommand, ...]:
+def load_trajectories(
+    texts: Sequence[str], robot: Robot, flags: str = "--traj"
+) -> tuple[NamedCommand, ...]:
     """Load the trajectories of one weight set; `all` are the three of the paper.
+
+    Args:
+        texts, robot: names or files, and who walks.
+        flags: by which they are given, for messages.
 
     Raises:
         InputError: see `load_trajectory` and `trajectories_by_name`; or their lengths differ.
@@ -284,7 +290,7 @@ def load_trajectories(texts: Sequence[str], robot: Robot) -> tuple[NamedCommand,
     lengths = {trajectory.name: trajectory.seconds or Walk.seconds for trajectory in loaded}
     if len(set(lengths.values())) > 1:
         lasts = ", ".join(f"{name} {seconds:g} s" for name, seconds in lengths.items())
-        raise InputError(f"--traj expects trajectories of one length, got {lasts}")
+        raise InputError(f"{flags}: expected trajectories of one length, got {lasts}")
     return loaded
 
 

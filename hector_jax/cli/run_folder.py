@@ -87,7 +87,7 @@ def kept_trajectories(
     Raises:
         InputError: there is no such trajectory, it is tuned, or is of another length.
     """
-    loaded = arguments.load_trajectories((*args.traj, *args.keep), robot)
+    loaded = arguments.load_trajectories((*args.traj, *args.keep), robot, "--traj and --keep")
     names = [trajectory.name for trajectory in tuned]
     for name in arguments.trajectories_by_name(args.keep):
         if name in names:

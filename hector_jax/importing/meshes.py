@@ -21,7 +21,7 @@ from jaxtyping import Float
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import read_text
 from hector_jax.importing.survey import Survey
-from hector_jax.robot.elements import MESHES, parsed
+from hector_jax.robot.elements import MESHES, parsed, repair_inertias
 from hector_jax.robot.links import Pose, pose_of, rotation_of, subtree
 from hector_jax.robot.mjcf import MOST_BYTES, read_mjcf
 from hector_jax.robot.source import compile_bare
@@ -104,6 +104,7 @@ def _of_urdf(path: Path) -> Iterator[MeshGeom]:
 def _of_mjcf(path: Path) -> Iterator[MeshGeom]:
     root = read_mjcf(path)
     spec, _, _ = parsed(path, root, (), None)
+    repair_inertias(path, spec)
     meshes = {mesh.name: mesh for mesh in spec.meshes}
     found = {}
     for i, geom in enumerate([x for x in spec.geoms if x.type in MESHES and x.meshname in meshes]):

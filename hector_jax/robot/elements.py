@@ -62,7 +62,7 @@ def spec_of(
     check_couplings(path, root, joints, weld)
     spec, notes, removed = parsed(path, root, joints, keyframe)
     removed += _remove_meshes(path, spec)
-    notes += _mend_inertias(path, spec)
+    notes += repair_inertias(path, spec)
     return spec, [*notes, *[f"{removed} meshes and pictures are not read"] * bool(removed)]
 
 
@@ -151,7 +151,7 @@ def _add_names(spec: mujoco.MjSpec) -> None:
             part.name = part.name or name
 
 
-def _mend_inertias(path: Path, spec: mujoco.MjSpec) -> list[str]:
+def repair_inertias(path: Path, spec: mujoco.MjSpec) -> list[str]:
     """Replace the inertias of bodies that have none, see the module's docstring. Returns a note."""
     total, changed = sum(body.mass for body in spec.bodies[1:] if body.explicitinertial), []
     for body in spec.bodies[1:]:

@@ -162,6 +162,8 @@ def columns_by_walks(
     names = step_names(nominal(robot), config.others)
     J = np.zeros((sum(x.size for x in now), len(names)))
     for at, step, *logs in moved.values():
+        if not step:  # a group that has no room in its boxes stays where it is
+            continue
         terms = zip(now, *map(of_log, logs), strict=True)
         changes = [changed_by(here, before, after, span).ravel() for here, before, after in terms]
         J[:, at] = np.concatenate(changes)[:, None] / step / len(at)
