@@ -48,13 +48,13 @@ from hector_jax.control.weights_file import best
 from hector_jax.core.console import exit_code, say
 from hector_jax.core.settings import check
 from hector_jax.core.trajectory import Trajectory
-from hector_jax.report.motion import motions
 from hector_jax.report.plots.style import SETS, drawing, label_of, looks_of
-from hector_jax.report.video import VideoConfig, write_film, write_strip
 from hector_jax.robot.model import Robot
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections
 from hector_jax.verdict.foretell import HERE, calibrated
+from hector_jax.view.motion import motions
+from hector_jax.view.video import VideoConfig, write_film, write_strip
 
 ROOT = Path(__file__).parents[1]
 OUT = ROOT / "docs" / "pictures"

@@ -11,13 +11,13 @@ import hector_jax
 
 ROOT = Path(__file__).parents[1] / "hector_jax"
 METHOD = "core robot qp control sim grfm tuning".split()
-APPLICATION = "importing own store verdict walk_tuning export report cli __main__".split()
+APPLICATION = "importing own store verdict walk_tuning export report view cli __main__".split()
 FLOOR = {room: height for height, room in enumerate([*METHOD, *APPLICATION])}
 DOORS = {"mujoco": ("core.headless", "sim.mjx_model"), "pydrake": ("sim.drake",)}
 DOORS |= {"pinocchio": ("sim.pinocchio",), "coal": ("sim.pinocchio",)}
 DOORS |= {
-    "viser": ("report.view",),
-    "trimesh": ("report.view", "importing.meshes"),
+    "viser": ("view.",),
+    "trimesh": ("view.", "importing.meshes"),
     "flax": ("grfm.nets",),
 }
 DOORS |= {"optax": ("grfm.nets", "tuning.difftune", "tuning.step_rules")}

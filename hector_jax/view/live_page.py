@@ -1,7 +1,7 @@
 """The page of a live walk: robots, what they are at, and all that a person can turn.
 
 All clients see one page. What they click or move is done in turn by the loop of `serve_live`; the
-robots walk in another process (`report.live`). Weights are moved as a tuning moves them, by their
+robots walk in another process (`view.live`). Weights are moved as a tuning moves them, by their
 logarithms and with one weight for all feet.
 """
 
@@ -17,14 +17,14 @@ from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.trajectory import FEET, SOLVED
-from hector_jax.report.live import Frame, Walked
-from hector_jax.report.live_tuning import Tuner
-from hector_jax.report.live_weights import PageSetup, WeightsPanel
-from hector_jax.report.motion import INK
 from hector_jax.report.plots.style import rgb_of
-from hector_jax.report.view_parts import add_floor, body_meshes, plot
 from hector_jax.sim.live import PUSH_TIME, WINDOW, Now
 from hector_jax.sim.world import MAX_DELAY, WORLDS, Imperfections, named_world
+from hector_jax.view.live import Frame, Walked
+from hector_jax.view.live_tuning import Tuner
+from hector_jax.view.live_weights import PageSetup, WeightsPanel
+from hector_jax.view.motion import INK
+from hector_jax.view.page_parts import add_floor, body_meshes, plot
 
 _STRIP = 10.0  # [s] of the errors that are drawn
 _SLOW = 0.95  # share of the wanted speed below which the machine is too slow
