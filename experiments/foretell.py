@@ -247,7 +247,7 @@ def calibration(pairs: Sequence[Pair], known: Mapping[str, Any]) -> dict[str, An
             "several": several(found) or before.get("several", {}),
             "pairs": rows,
         }
-    return {"code": code_hash("verdict.foretell"), "pairs": groups}
+    return {"code": code_hash(("verdict.foretell",)), "pairs": groups}
 
 
 def several(pairs: Sequence[Pair]) -> dict[str, tuple[int, int]]:

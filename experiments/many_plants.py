@@ -113,7 +113,7 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
         "numbers": list(campaign.config.others),
         "start": weights_tree(campaign.start),
         "plants": [tree_hash(plant) for plant in campaign.plants],
-        "code": [code_hash("walk_tuning.walks", *engine.modules), function_id(search)],
+        "code": [code_hash(("walk_tuning.walks", *engine.modules)), function_id(search)],
         **{name: getattr(flags, name) for name in ("population", "spread", "seed")},
     }
     others = campaign.config.others

@@ -231,7 +231,7 @@ def test_a_result_holds_for_the_code_that_computes_it(see, tmp_path, module, old
     text = source(module).read_text()
     assert old in text
     edited.write_text(text.replace(old, new))
-    hashes = lambda: [code_hash("sim.walk"), code_hash("tuning.difftune", "grfm.network")]  # noqa: E731
+    hashes = lambda: [code_hash(x) for x in (("sim.walk",), ("tuning.difftune", "grfm.network"))]  # noqa: E731
     before = hashes()
     see("_source", lambda name: edited if name == module else source(name))
     assert [x == y for x, y in zip(before, hashes(), strict=True)] == [same, same]

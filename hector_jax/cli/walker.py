@@ -291,16 +291,19 @@ def _campaign(
 ) -> Campaign:
     """Return the settings of a tuning on the walks of a program."""
     kept = run_folder.kept_trajectories(args, robot, trajectories)
-    given, groups = (args.walk_plants, args.walks, len(trajectories)), args.slopes == "walks"
+    groups, commands = args.slopes == "walks", len(trajectories)
     start = arguments.weights_by_name(args.start, robot)
     along = len(along_of(start, config.others, groups))
+    plants, _ = best_set.walk_plants(
+        robot, args.walk_plants, args.walks, commands, along=along, kept=len(kept)
+    )
     return Campaign(
         folder / "walks",
         best_set.on_walks(config),
         robot,
         start,
         {trajectory.name: trajectory.command for trajectory in trajectories},
-        best_set.walk_plants(robot, *given, along=along, kept=len(kept))[0],
+        plants,
         arguments.engine_of(args),
         arguments.planner_of(args),
         groups,

@@ -83,7 +83,7 @@ def _commit(folder: Path) -> str:
 
 
 @cache
-def code_hash(*modules: str) -> str:
+def code_hash(modules: tuple[str, ...]) -> str:
     """Return a hash (12 hexadecimal digits) of the code and packages that determine a result.
 
     It covers the syntax trees, without docstrings, of the modules, of every module of this package
