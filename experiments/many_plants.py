@@ -34,7 +34,7 @@ from hector_jax.core.files import make_folder
 from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError, plural, require_package
 from hector_jax.core.journal import add_row, continue_journal
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, Range
 from hector_jax.core.trajectory import SOLVED
 from hector_jax.core.tree import stack

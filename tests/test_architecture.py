@@ -2,6 +2,7 @@
 
 import ast
 from collections import Counter
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -109,3 +110,12 @@ def test_a_function_takes_at_most_five_positional_arguments():
             if isinstance(node, ast.FunctionDef):
                 names = {arg.arg for arg in node.args.posonlyargs + node.args.args}
                 assert len(names - {"self", "cls"}) <= 5, (path.name, node.name)
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    """Also not inside of functions."""
+    inside = {name_of(path): set() for path in FILES if path.stem != "__init__"}
+    for name, target in IMPORTS:
+        if name in inside and (target := target.removeprefix("hector_jax.")) in inside:
+            inside[name].add(target)
+    TopologicalSorter(inside).prepare()  # raises CycleError

@@ -14,7 +14,7 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.weights import Weights
 from hector_jax.core.console import Broken, say
 from hector_jax.core.inputs import InputError, require_package
-from hector_jax.core.runtime import start_process, workers
+from hector_jax.core.pool import start_process, workers
 from hector_jax.robot.model import Robot, compile_model, load_robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import WORLDS, named_world

@@ -17,7 +17,7 @@ from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import say
 from hector_jax.core.files import locked, make_folder, write_json
 from hector_jax.core.inputs import InputError, plural, unknown
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 from hector_jax.own import walk_log
 from hector_jax.robot.model import load_robot
 from hector_jax.store import tunings

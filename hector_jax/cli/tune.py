@@ -25,7 +25,7 @@ from hector_jax.core.console import say
 from hector_jax.core.environment import environment
 from hector_jax.core.files import locked, write_json
 from hector_jax.core.inputs import InputError, plural
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.network import as_effect

@@ -18,7 +18,7 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.core.console import Broken, bar, say, say_if_slow
 from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError, plural, printable
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 from hector_jax.core.trajectory import SOLVED
 from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import save_tree

@@ -23,7 +23,7 @@ from hector_jax.control.weights_file import save_weights
 from hector_jax.core.console import say
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, plural
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 from hector_jax.core.trajectory import FEET, State, Trajectory
 from hector_jax.own.conventions import find_conventions, lines_of, settings_of
 from hector_jax.own.log_check import check_log, read_check, unasked

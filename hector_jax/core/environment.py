@@ -20,7 +20,8 @@ from hector_jax.core.numerics import without_our_flags
 # modules that do not affect numerical results
 _NO_NUMBERS = (
     "control.weights_file core.cluster core.console core.environment core.files core.identity"
-    " core.inputs core.journal core.runtime core.tree_file store.cache store.run store.setup"
+    " core.inputs core.journal core.pool core.runtime core.tree_file store.cache"
+    " store.run store.setup"
 ).split()
 _NUMERICS = "core.numerics"  # JAX's options, on which all numbers depend
 # imported names whose package has another name or brings another package that computes
