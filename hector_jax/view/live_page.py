@@ -135,7 +135,10 @@ class LivePage:
 
     def _add_errors(self) -> None:
         gui = self._server.gui
-        gui.add_markdown("Forces of the ground: black as planned, orange as measured.")
+        gui.add_markdown(
+            "Forces of the ground: black as planned, orange as measured; they end inside the "
+            "friction cone of the floor, or the foot slips."
+        )
         with gui.add_folder(f"Errors, RMS of the last {WINDOW:g} s"):
             self._table = gui.add_markdown("")
             empty = {name: np.full(1, np.nan) for name in self._names}
@@ -225,6 +228,7 @@ class LivePage:
                 {
                     "bodies": bodies,
                     "arrows": [self._add_arrows(f"{root}/{kind}", kind) for kind in _FORCES],
+                    "cones": self._add_cones(f"{root}/cone"),
                     "aim": scene.add_icosphere(f"{root}/aim", 0.018, INK),
                 }
             )
@@ -238,6 +242,13 @@ class LivePage:
         feet = range(len(robot.foot_point))
         add = self._server.scene.add_arrows
         return [add(f"{root}{foot}", points, _FORCES[kind], **size) for foot in feet]
+
+    def _add_cones(self, root: str) -> list[Any]:
+        """Add the edges of the friction cone of each foot, as high as the force on it."""
+        edges, colours = np.zeros((8, 2, 3), np.float32), _FORCES["measured"]
+        add = self._server.scene.add_line_segments
+        feet = range(len(self._setup.robot.foot_point))
+        return [add(f"{root}{foot}", edges, colours, thickness=0.004) for foot in feet]
 
     def show(self, frame: Frame) -> None:
         """Show a frame; numbers and strips four times a second."""
@@ -270,6 +281,11 @@ class LivePage:
                 if arrow.visible:
                     end = _ARROW * height / weight * force
                     arrow.points = np.stack([np.zeros(3), end])[None].astype(np.float32)
+        for cone, foot, force in zip(handles["cones"], now.feet, now.measured, strict=True):
+            cone.position, cone.visible = foot, bool(force[2] > _LOADED * weight)
+            if cone.visible:
+                up = _ARROW * height / weight * force[2]
+                cone.points = up * _cone_edges(float(self._plant.floor_friction))
         handles["aim"].position = now.reference
 
     def _show_numbers(self, frame: Frame) -> None:
@@ -304,6 +320,13 @@ class LivePage:
         solved = now.residual <= SOLVED
         qp = "QP solved" if solved else f"**QP not solved**, residual {now.residual:.0e}"
         return f"{now.time:.1f} s; {qp}; " + ("; ".join(text) or "in the air")
+
+
+def _cone_edges(mu: float) -> Float[np.ndarray, "8 2 3"]:
+    """Return the edges of the cone |F_x| + |F_y| <= mu F_z up to F_z = 1: four up, four around."""
+    rim = np.array([[mu, 0.0, 1.0], [0.0, mu, 1.0], [-mu, 0.0, 1.0], [0.0, -mu, 1.0]], np.float32)
+    sides = np.stack([np.zeros_like(rim), rim], axis=1)
+    return np.concatenate([sides, np.stack([rim, np.roll(rim, -1, axis=0)], axis=1)])
 
 
 def _row(name: str, errors: Float[np.ndarray, "6"]) -> str:
