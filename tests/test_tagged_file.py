@@ -119,7 +119,9 @@ def test_the_numbers_of_each_format_are_read_and_the_same_ones_change_no_byte(pa
 positive = st.floats(1e-12, 1e12)
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(st.lists(positive, min_size=24, max_size=24))
 def test_what_is_written_is_read_exactly_and_only_digits_differ(path, numbers):
     shared = {}
@@ -238,6 +240,6 @@ def test_commands_take_the_file_and_write_a_copy(path, monkeypatch, capsys):
     assert call(*line, folder / "tuned.json") == 0
     other = capsys.readouterr().out
     assert found == other
-    assert call("export", "best", "--into", path, "--out", folder) == 2
+    assert call("export", "shipped", "--into", path, "--out", folder) == 2
     assert "would be overwritten" in capsys.readouterr().err
     assert path.read_bytes() == before
