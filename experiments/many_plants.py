@@ -2,8 +2,8 @@
 
 CMA-ES over the mean loss on several plants of `hfs-varied` and all three commands at once, from
 `shipped` or another start, in the steps of the tuner (`parameters.stepped`). Its answer is the mean
-of the last distribution. It walks on the plants of the search and on as many others: what it gains on
-the former alone is fitted to them.
+of the last distribution. It walks on the plants of the search and on as many others: what it gains
+on the former alone is fitted to them.
 
     python experiments/many_plants.py --tune weights
     python experiments/many_plants.py --tune all --generations 40

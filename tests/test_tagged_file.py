@@ -119,9 +119,7 @@ def test_the_numbers_of_each_format_are_read_and_the_same_ones_change_no_byte(pa
 positive = st.floats(1e-12, 1e12)
 
 
-@settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(positive, min_size=24, max_size=24))
 def test_what_is_written_is_read_exactly_and_only_digits_differ(path, numbers):
     shared = {}
