@@ -401,12 +401,12 @@ def disturbances():
     for text, level in DISTURBANCES.items():
         yield RESULTS, row(text, *map(str, count(rf"\w+ \S+ {level}")))
     for pattern, text in {
-        ".* push 125 N": "125 N `shipped` falls in {2} of {0} walks, and `nominal` in {1}",
-        "s standin push (?!125).*": "100 N on S `shipped` falls in {2} of {0}, `nominal` in {1}",
-        "s .* friction 0.3": "both fall in most walks: `shipped` in {2} of {0}, `nominal` in {1}",
+        ".* push 125 N": "Under 125 N {name} falls in {2} of {0} walks, and `nominal` in {1}",
+        "s standin push (?!125).*": "50 to 100 N on S {name} falls in {2} of {0}, `nominal` in {1}",
+        "s .* friction 0.3": "0.3 both fall in most walks: {name} in {2} of {0}, `nominal` in {1}",
     }.items():
         walks, *falls = count(pattern)
-        yield LIMITS, text.format(walks, *falls)
+        yield LIMITS, text.format(walks, *falls, name="`shipped`")
     assert min(falls) > walks / 2
     shares = [
         100 * one["falls"] / one["walks"]
