@@ -3,23 +3,26 @@
     method        how a tuning works, as a block diagram
     own           a controller of one's own: what its user provides, and the first minutes
     film          the robot with plain and with tuned weights, side by side
-    before-after  errors along one walk of the sets nominal, expert and best
+    before-after  errors along one walk of the sets nominal, expert and shipped
     foretold      loss walked by loss foretold, with intervals
     race          loss by the number of walks, against CMA-ES and Bayesian optimisation
     robots        four robots walking
     page          the browser page of a run (needs Chromium and a run: --run)
     live          the browser page of a live walk (needs Chromium)
+    live-film     ten seconds of it, in which a weight is turned and the robot pushed
 
 Walks are those of the first plant of the hardware stand-in, which no tuning has read; the robots of
 `robots` walk on the high-fidelity simulator.
 """
 
 import json
+import re
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -44,17 +47,17 @@ from hector_jax import (
     walk,
     walk_config,
 )
-from hector_jax.control.weights_file import best
+from hector_jax.control.weights_file import shipped
 from hector_jax.core.console import exit_code, say
 from hector_jax.core.settings import check
 from hector_jax.core.trajectory import Trajectory
-from hector_jax.report.motion import motions
 from hector_jax.report.plots.style import SETS, drawing, label_of, looks_of
-from hector_jax.report.video import VideoConfig, write_film, write_strip
 from hector_jax.robot.model import Robot
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections
 from hector_jax.verdict.foretell import HERE, calibrated
+from hector_jax.view.motion import motions
+from hector_jax.view.video import VideoConfig, write_film, write_strip
 
 ROOT = Path(__file__).parents[1]
 OUT = ROOT / "docs" / "pictures"
@@ -215,7 +218,7 @@ def draw_own(path: Path) -> None:
 
 def draw_film(path: Path) -> None:
     """Film the plain and the tuned weights on one plant."""
-    robot, pair = load_robot(), {"nominal": nominal(), "best": best()}
+    robot, pair = load_robot(), {"nominal": nominal(), "shipped": shipped()}
     walks = {name: walk_of(robot, weights, standin(0), 4.0) for name, weights in pair.items()}
     config = VideoConfig(width=720, height=488, rate=12)
     write_film(path, robot, motions(robot, walks), config)
@@ -223,7 +226,7 @@ def draw_film(path: Path) -> None:
 
 def draw_before_after(path: Path) -> None:
     """Draw the distance from the reference and the error in pitch along one walk of each set."""
-    sets = {"nominal": nominal(), "expert": expert(), "best": best()}
+    sets = {"nominal": nominal(), "expert": expert(), "shipped": shipped()}
     with drawing(path, 7.2, 2.6, dpi=190.0) as figure:
         left, right = figure.subplots(1, 2)
         for name, look in looks_of(sets).items():
@@ -259,8 +262,8 @@ def draw_race(path: Path) -> None:
 
 
 def draw_robots(path: Path) -> None:
-    """Draw HECTOR with its set best, and three robots of the examples with plain weights."""
-    tiles = [_still(load_robot(), best(), "HECTOR: best")]
+    """Draw HECTOR with its set shipped, and three robots of the examples with plain weights."""
+    tiles = [_still(load_robot(), shipped(), "HECTOR: shipped")]
     for name in ("strider", "quadruped", "humanoid"):
         robot = load_robot(ROOT / "examples" / name / "robot.toml")
         tiles.append(_still(robot, nominal(robot), f"{name}: nominal"))
@@ -297,11 +300,49 @@ def draw_page(path: Path, run: Path) -> None:
 
 def draw_live(path: Path) -> None:
     """Take a picture of the page of `hector view --live`, after some seconds of walking."""
-    _take_picture(path, ["--live", "--weights", "nominal", "best"], "Real-time factor", 25.0)
+    _take_picture(path, ["--live", "--weights", "nominal", "shipped"], "Real-time factor", 25.0)
+
+
+def draw_live_film(path: Path) -> None:
+    """Film the page of `hector view --live` at a tenth of its speed, shown ten times as fast.
+
+    Q_pitch is turned down after three seconds and back after six; a push from behind follows.
+    """
+    acts = {
+        3.0: lambda tab: tab.fill("Q_pitch", "0"),
+        6.0: lambda tab: tab.click("Undo"),
+        8.0: lambda tab: tab.click("from behind"),
+    }
+    frames: list[Image.Image] = []
+    flags = ["--live", "--weights", "shipped"]
+    with _opened_page(flags, "Real-time factor", 20.0, height=720) as tab:
+
+        def now() -> float:
+            return float(re.search(r"shipped: (-?[\d.]+) s; ", tab.text())[1])  # pyright: ignore
+
+        tab.fill("speed [real time]", "0.1")
+        start = shown = now()
+        while shown < start + 10.0:
+            if (at := now()) < shown + 0.2:
+                continue
+            for due in [due for due in acts if due < at - start]:
+                acts.pop(due)(tab)
+            shown = at
+            frames.append(Image.fromarray(tab.picture()).resize((800, 480)))
+    frames[0].save(
+        path, save_all=True, append_images=frames[1:], duration=200, loop=0, quality=60, method=6
+    )
 
 
 def _take_picture(path: Path, flags: list[str], words: str, seconds: float) -> None:
     """Take a picture of the page of `hector view`, so long after it shows these words."""
+    with _opened_page(flags, words, seconds) as tab:
+        Image.fromarray(tab.picture()).save(path, optimize=True)
+
+
+@contextmanager
+def _opened_page(flags: list[str], words: str, seconds: float, height: int = 960) -> Iterator[Any]:
+    """Open the page of `hector view` in a browser, until so long after it shows these words."""
     sys.path.insert(0, str(ROOT / "tests"))
     from browser import opened  # pyright: ignore[reportMissingImports]
 
@@ -310,14 +351,17 @@ def _take_picture(path: Path, flags: list[str], words: str, seconds: float) -> N
     try:
         assert server.stderr is not None
         address = next(x for x in server.stderr if x.startswith("open http")).split()[1]
-        with tempfile.TemporaryDirectory() as profile, opened(address, profile, height=960) as tab:
+        with (
+            tempfile.TemporaryDirectory() as profile,
+            opened(address, profile, height=height) as tab,
+        ):
             deadline = time.monotonic() + 240.0
             while words not in tab.text() and time.monotonic() < deadline:
                 time.sleep(2.0)
             time.sleep(seconds)
             tab.call("Runtime.evaluate", expression=CLOSE_NOTICES)
             time.sleep(2.0)
-            Image.fromarray(tab.picture()).save(path, optimize=True)
+            yield tab
     finally:
         server.terminate()
         server.wait()
@@ -348,6 +392,7 @@ PICTURES: dict[str, tuple[Path, Callable[[Path], None] | None]] = {
     "robots": (OUT / "robots.png", draw_robots),
     "page": (OUT / "page.png", None),  # takes the run too
     "live": (OUT / "live.png", draw_live),
+    "live-film": (OUT / "live.webp", draw_live_film),
 }
 
 
