@@ -247,6 +247,7 @@ def _sizes(config: WalkConfig, sides: int) -> dict[str, Any]:
     feet, steps, model = len(config.gait.offsets), config.mpc.horizon, config.mpc.contact
     contacts, usual = steps * feet, steps * config.gait.most_contacts * model.inputs
     variables, limit = contacts * model.inputs, 100 + 6 * usual
+    numbers = variables * (4 * variables + 23) + contacts * sides * (model.inputs + 1) + 30 * steps
 
     def millions(n: int, active: int, changes: int) -> float:
         """Return multiplications: factorisations, and the changes of the active set."""
@@ -254,16 +255,12 @@ def _sizes(config: WalkConfig, sides: int) -> dict[str, Any]:
         return 1e-6 * (2 * n**3 + changes * change)
 
     return {
-        "contacts": contacts,
         "inputs": model.inputs,
         "components": ", ".join(_COMPONENTS[i] for i in model.components),
         "sides": sides,
         "variables": variables,
         "limit": limit,
-        "kilobytes": round(
-            8e-3 * (variables * (4 * variables + 23) + contacts * sides * (model.inputs + 1))
-        )
-        + 2,
+        "kilobytes": round(8e-3 * numbers) + 2,
         "stack": 14 + contacts * sides // 100,
         "usual": round(millions(usual, usual // 5, usual // 5), 1),
         "most": round(millions(variables, variables, limit)),
