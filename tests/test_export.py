@@ -497,18 +497,29 @@ def test_the_library_allocates_nothing(library):
     assert "sincos" in listed or "sin" in listed
 
 
+SANITIZERS = "-O1 -g -fsanitize=address,undefined -fno-sanitize-recover"
+BUILDS = [("cc", SANITIZERS, []), ("aarch64-linux-gnu-gcc", "-O2 -static", ["qemu-aarch64"])]
+
+
 @pytest.mark.slow
-def test_address_and_undefined_behaviour_are_clean_along_the_walk(walked, tmp_path):
-    inputs = inputs_of(walked, ROBOT)
+@pytest.mark.parametrize("build", BUILDS, ids=["sanitizers", "aarch64"])
+def test_another_build_walks_as_the_first_does(walked, tmp_path, build):
+    for program in (build[0], *build[2]):
+        if shutil.which(program) is None:
+            pytest.skip(f"there is no {program}")
+    inputs, sums = inputs_of(walked, ROBOT), []
     inputs.estimate["euler"][700, 1], inputs.estimate["velocity"][800] = np.nan, 1e150
     compile_controller(source_of(TUNED), tmp_path)
-    for name, part in inputs._asdict().items():
-        part.tofile(tmp_path / name)
-    flags = "-std=c99 -O1 -g -fsanitize=address,undefined -fno-sanitize-recover -I. -o walk"
-    words = ["cc", HERE / "exported_walk.c", "controller.c", *flags.split(), "-lm"]
-    subprocess.run(words, cwd=tmp_path, check=True)
-    run = subprocess.run(["./walk", *inputs._fields], cwd=tmp_path, capture_output=True, text=True)
-    assert (run.returncode, run.stderr, np.isfinite(float(run.stdout))) == (0, "", True)
+    for file, part in inputs._asdict().items():
+        part.tofile(tmp_path / file)
+    for compiler, flags, runner in (("cc", "-O2", []), build):
+        words = [compiler, "-std=c99", *flags.split(), HERE / "exported_walk.c", "controller.c"]
+        subprocess.run([*words, "-I.", "-lm", "-o", "walk"], cwd=tmp_path, check=True)
+        words = [*runner, "./walk", *inputs._fields]
+        ran = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+        assert (ran.returncode, ran.stderr) == (0, "")
+        sums.append(float(ran.stdout))
+    assert sums[1] == pytest.approx(sums[0], abs=1e-8)
 
 
 def test_weights_that_fall_and_constraints_of_ones_own_are_refused():
@@ -606,9 +617,12 @@ def test_a_run_is_exported_with_its_own_controller(run):
     assert Run(run).controller == own
 
 
-def test_a_set_that_is_not_there_is_one_line_and_writes_nothing(monkeypatch, capsys, run):
-    line = refused(monkeypatch, capsys, "export", run, "--set", "bset")
-    assert "did you mean 'best'" in line
+@pytest.mark.parametrize(
+    ("flag", "word", "told"),
+    [("--set", "bset", "did you mean 'best'"), ("--prefix", "1st", "must be a name in C")],
+)
+def test_what_is_refused_is_one_line_and_writes_nothing(monkeypatch, capsys, run, flag, word, told):
+    assert told in refused(monkeypatch, capsys, "export", run, flag, word)
     assert not (run / "export").exists()
 
 
