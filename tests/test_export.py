@@ -36,7 +36,7 @@ from hector_jax.control.contact import (
 )
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
-from hector_jax.control.parameters import TUNABLES
+from hector_jax.control.parameters import TUNABLES, Q, R
 from hector_jax.control.reference import Command, named_command
 from hector_jax.control.weights import nominal
 from hector_jax.control.weights_file import load_weights, save_weights
@@ -417,6 +417,17 @@ def test_weights_out_of_bounds_are_refused_and_change_nothing(library, walked, v
     inputs = inputs_of(walked, ROBOT)
     inputs = inputs._replace(estimate=inputs.estimate[:30], anchor=inputs.anchor[:30])
     np.testing.assert_array_equal(answers(library, inputs, change), answers(library, inputs))
+
+
+def test_other_weights_are_bounded_by_the_boxes_of_the_tuner(library):
+    functions, parameters = ctypes.CDLL(str(library)), CONFIG.parameters(TUNED)
+    boxes = [*[Q] * 12, *[R] * 12]
+    for tunable in TUNABLES.values():
+        boxes += [tunable] * np.size(tunable.read(parameters))
+    exported = list(exported_numbers(functions))
+    for end, further in (("lower", np.minimum), ("upper", np.maximum)):
+        found = (ctypes.c_double * len(boxes)).in_dll(functions, f"controller_{end}")
+        assert list(found) == further([getattr(box, end) for box in boxes], exported).tolist()
 
 
 @pytest.fixture(scope="module")
