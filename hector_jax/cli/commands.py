@@ -188,17 +188,16 @@ def run_export(args: flags.Export) -> None:
             f"{robot.description.path}: {text}, but they are to a file of yours: --into"
         )
     say("exporting the controller and comparing it with the live one on a walk")
-    with locked(folder):
-        card = export.export(
-            run.controller if run else walk_config(robot),
-            robot,
-            weights,
-            trajectory.command,
-            folder,
-            name=name,
-            seconds=args.seconds,
-            prefix=args.prefix,
-        )
+    card = export.export(
+        run.controller if run else walk_config(robot),
+        robot,
+        weights,
+        trajectory.command,
+        folder,
+        name=name,
+        seconds=args.seconds,
+        prefix=args.prefix,
+    )
     print_result(args.json, card, lambda: _print_check(card["check"] or {}))
     say(f"the export is in {folder}")
 
