@@ -1,18 +1,14 @@
 """The TOML file with names, limits, gait and weights that accompanies a robot's model.
 
     name = "strider"                   # its walks and net are stored under this name
-    model = "strider.xml"              # MJCF or URDF, beside this file
-    standing = "home"                  # keyframe of the standing pose, or angles: { knee = 0.5 }
+    model = "strider.xml"              # MJCF in the standard form (`checks`), beside this file
+    standing = "standing"              # keyframe of the standing pose
     [joints]                           # of each leg, from the trunk down
     left, right = three to seven names each; of four legs: front_left, front_right, hind_left, ..
     linkage = [5, 4]                   # the fifth joint's motor also turns the fourth; optional
-    weld = ["waist"]                   # hinges that are fixed in the standing pose
-    armature = one number per joint    # [kg m^2] of a leg's motors, which a URDF cannot state
-    range, torque = [lower, upper] and a number per joint  # [rad], [N m] where the model has none
-    [feet]                             # per leg: names in the model, or points in a body's frame
-    left, right = { point = site on the sole, toe = geom, heel = geom }
-    left, right = { point = site, contacts = [geom, ...] }                   # 1, 2 or 4 contacts
-    left, right = { body, contacts = [[x, y, z], ...], point = [x, y, z] }   # as many
+    [feet]                             # by leg: names of a site on the sole and of spheres
+    left, right = { point = site, toe = sphere, heel = sphere }
+    left, right = { point = site, contacts = [sphere, ...] }                 # 1, 2 or 4 contacts
     [limits]
     min_height, max_tilt               # [m] of the centre of mass, [rad]: beyond them it has fallen
     [gait] [mpc] [slip] [footstep] [legs] [twin]  # fields of GaitConfig, MpcConfig and so on
@@ -22,13 +18,14 @@
     [tuning] [plants]                  # fields of TuningSettings, PlantSizes
     [numbers.NAME]                     # of a user's controller: fields of Number
 
-The model must be named; all other defaults are those of assets/hector.toml,
-but without [slip] the controller does not react to slips. Masses, lengths, joint
-and torque limits come from the model; a description is a static field of its `Robot` under jit.
+The model must be named; all other defaults are those of assets/hector.toml, but without [slip] the
+controller does not react to slips. Masses, lengths, joint and torque limits come from the model; a
+description is a static field of its `Robot` under jit. Published robots have more keys
+(`importing.draft`), with which `hector robot` brings them into this form.
 """
 
-import math
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -45,31 +42,20 @@ _ASSETS = _INSTALLED if _INSTALLED.exists() else _PACKAGE.parent / "assets"
 MODEL_PATH = _ASSETS / "hector.xml"
 DESCRIPTION_PATH = _ASSETS / "hector.toml"
 
-LEG_JOINTS = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle")
 FEWEST_JOINTS, MOST_JOINTS = 3, 7  # of a leg
 CONTROL = ("gait", "mpc", "slip", "footstep", "legs", "twin")  # sections that the controller reads
+
+PUBLISHED = ("weld", "armature", "range", "torque")  # keys of joints that are not in this form
 
 MAX_BYTES = 100_000
 
 Triple = tuple[float, float, float]
 
 
-def _joint_names(side: str) -> tuple[str, ...]:
-    return tuple(f"{side}_{joint}" for joint in LEG_JOINTS)
-
-
 class Foot(NamedTuple):
-    """A foot in the model's file, by names in it or by points in the frame of a body."""
+    """A foot by names in the model."""
 
-    point: str | Triple | None  # site; or point where wrenches act [m]; None: middle of contacts
-    contacts: tuple[str | Triple, ...]  # spheres; or contact points of the sole [m]
-    body: str | None = None  # whose frame the points are in
-
-
-class NamedFoot(NamedTuple):
-    """A foot in the compiled model, where site and spheres have names."""
-
-    point: str  # site
+    point: str  # site where wrenches act
     contacts: tuple[str, ...]  # spheres
 
 
@@ -106,21 +92,15 @@ class TuningSettings:
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Description:
-    """The content of a robot's TOML; the defaults are the names and limits of HECTOR."""
+    """The content of a robot's TOML."""
 
-    model: Path = MODEL_PATH  # MJCF or URDF
-    path: Path = DESCRIPTION_PATH  # of the TOML
-    name: str = "hector"
-    standing: str | tuple[tuple[str, float], ...] = "standing"  # keyframe, or angles [rad] by joint
-    joints: tuple[str, ...] = _joint_names("left") + _joint_names("right")
-    linkage: tuple[int, int] | None = (5, 4)  # motor, and joint it also turns; counted from 1
-    weld: tuple[str, ...] = ()  # joints
-    armature: tuple[float, ...] = ()  # [kg m^2] of the joints of a leg; empty: the model's
-    range: tuple[tuple[float, float], ...] = ()  # [rad] of those of a leg without one in the model
-    torque: tuple[float, ...] = ()  # [N m] limits of those of a leg without one in the model
-    feet: tuple[Foot, ...] = tuple(
-        Foot(f"{side}_foot_point", (f"{side}_toe", f"{side}_heel")) for side in FEET[2]
-    )
+    model: Path  # MJCF
+    path: Path  # of the TOML
+    name: str
+    standing: str  # keyframe
+    joints: tuple[str, ...]  # leg by leg
+    linkage: tuple[int, int] | None  # motor, and joint it also turns; counted from 1
+    feet: tuple[Foot, ...]  # in the order of FEET
     min_height: float = MIN_HEIGHT  # [m] of the centre of mass; below it the robot has fallen
     max_tilt: float = MAX_TILT  # [rad] of roll or pitch; beyond it the robot has fallen
     control: tuple[tuple[str, tuple[tuple[str, Any], ...]], ...] = ()  # unchecked sections
@@ -140,24 +120,9 @@ class Description:
         return self.min_height, self.max_tilt
 
     @property
-    def standing_key(self) -> str:
-        """Keyframe of the standing pose in the compiled model."""
-        return self.standing if isinstance(self.standing, str) else "standing"
-
-    @property
     def legs(self) -> tuple[str, ...]:
         """Names of the legs."""
         return FEET[len(self.feet)]
-
-    @property
-    def named_feet(self) -> tuple[NamedFoot, ...]:
-        """Site and spheres of each foot in the compiled model."""
-        return tuple(
-            NamedFoot(f"{leg}_point", tuple(f"{leg}_contact_{i}" for i in range(len(contacts))))
-            if body is not None
-            else NamedFoot(str(point), tuple(map(str, contacts)))
-            for leg, (point, contacts, body) in zip(self.legs, self.feet, strict=True)
-        )
 
     @property
     def leg_joints(self) -> int:
@@ -165,7 +130,7 @@ class Description:
         return len(self.joints) // len(self.feet)
 
 
-def _by_leg(section: Any, default: Any) -> dict[str, Any]:
+def by_leg(section: Any, default: Any) -> dict[str, Any]:
     """Return the values of a section that are not the default, by leg in the order of FEET.
 
     Raises:
@@ -190,18 +155,14 @@ class Joints:
     hind_left: tuple[str, ...] = ()
     hind_right: tuple[str, ...] = ()
     linkage: tuple[int, int] | None = None
-    weld: tuple[str, ...] = ()
-    armature: Annotated[tuple[float, ...], NOT_NEGATIVE] = ()
-    range: tuple[tuple[float, float], ...] = ()
-    torque: Annotated[tuple[float, ...], POSITIVE] = ()
 
     @property
     def legs(self) -> dict[str, tuple[str, ...]]:
         """Joints by leg."""
-        return _by_leg(self, ())
+        return by_leg(self, ())
 
     def __post_init__(self) -> None:
-        names = sum(self.legs.values(), self.weld)
+        names = sum(self.legs.values(), ())
         counts = [len(joints) for joints in self.legs.values()]
         count = counts[0]
         if not FEWEST_JOINTS <= count <= MOST_JOINTS or set(counts) != {count}:
@@ -212,12 +173,6 @@ class Joints:
         if len(set(names)) < len(names):
             duplicate = next(name for name in names if names.count(name) > 1)
             raise InputError(f"must be different names, got {short_repr(duplicate)} twice")
-        for name in ("armature", "range", "torque"):
-            if len(value := getattr(self, name)) not in (0, count):
-                text = f"{name} must be {'a pair' if name == 'range' else 'a number'} for each of "
-                raise InputError(f"{text}the {count} joints of a leg, got {short_repr(value)}")
-        if any(not low < high for low, high in self.range):
-            raise InputError(f"range must rise, got {short_repr(self.range)}")
         if self.linkage and (
             not all(1 <= i <= count for i in self.linkage) or len(set(self.linkage)) < 2
         ):
@@ -227,34 +182,24 @@ class Joints:
 
 @dataclass(frozen=True)
 class _Foot:
-    point: str | Triple | None = None
+    point: str
     toe: str | None = None
     heel: str | None = None
-    body: str | None = None
-    contacts: tuple[str | Triple, ...] = ()
+    contacts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        point, contacts, body = self.foot
-        named = [isinstance(x, str) for x in contacts]
-        valid = len(contacts) in (1, 2, 4) and not (self.contacts and (self.toe or self.heel))
-        if body is None:
-            valid = valid and all(named) and isinstance(point, str)
-        else:
-            points = [*contacts, (0.0, 0.0, 0.0) if point is None else point]
-            valid = valid and not any(named) and not isinstance(point, str)
-            valid = valid and all(math.isfinite(float(x)) for at in points for x in at)
-        if not valid:
+        ends = self.toe is not None or self.heel is not None
+        if len(self.foot.contacts) not in (1, 2, 4) or (ends and self.contacts):
             raise InputError(
                 "must be names: point (a site) and toe and heel (spheres), or point and 1, 2 or 4 "
-                "contacts (spheres); or a body with 1, 2 or 4 contacts [x, y, z] on its sole and, "
-                "if wanted, a point [x, y, z]"
+                "contacts (spheres)"
             )
 
     @property
     def foot(self) -> Foot:
         """The foot in the form of the description."""
         ends = () if self.toe is None or self.heel is None else (self.toe, self.heel)
-        return Foot(self.point, ends or self.contacts, self.body)
+        return Foot(self.point, ends or self.contacts)
 
 
 @dataclass(frozen=True)
@@ -269,7 +214,7 @@ class _Feet:
     @property
     def feet(self) -> dict[str, Foot]:
         """Feet by leg."""
-        return {leg: foot.foot for leg, foot in _by_leg(self, None).items()}
+        return {leg: foot.foot for leg, foot in by_leg(self, None).items()}
 
     def __post_init__(self) -> None:
         counts = [len(foot.contacts) for foot in self.feet.values()]
@@ -308,11 +253,11 @@ class _Weights:
 
 @dataclass(frozen=True)
 class _File:
+    joints: Joints
+    feet: _Feet
+    standing: str
     name: str | None = None
     model: str = ""
-    standing: str | dict[str, float] = "standing"
-    joints: Joints = Joints(left=_joint_names("left"), right=_joint_names("right"))
-    feet: _Feet | None = None
     limits: _Limits = _Limits()
     gait: dict | None = None
     mpc: dict | None = None
@@ -327,18 +272,24 @@ class _File:
     numbers: dict[str, dict] | None = None
 
     def __post_init__(self) -> None:
-        legs, feet = tuple(self.joints.legs), self.feet and tuple(self.feet.feet)
-        if legs != (feet or FEET[2]):
-            got = f"{', '.join(feet)} in feet" if feet else "no [feet]"
-            text = f"joints has the legs {', '.join(legs)}, expected them in feet"
-            raise InputError(f"{text}, got {got}")
-        angles = self.standing.values() if isinstance(self.standing, dict) else ()
-        if not all(map(math.isfinite, angles)):
-            raise InputError(f"standing must be finite angles, got {short_repr(self.standing)}")
-        if not self.model:
-            raise InputError("model is missing: the name of an MJCF or URDF beside this file")
-        if Path(self.model).name != self.model:
-            raise InputError(f"model must name a file beside it, got {short_repr(self.model)}")
+        if tuple(self.joints.legs) != tuple(self.feet.feet):
+            text = f"joints has the legs {', '.join(self.joints.legs)}, expected them in feet"
+            raise InputError(f"{text}, got {', '.join(self.feet.feet)}")
+
+
+def model_name(path: Path, table: dict[str, Any]) -> str:
+    """Return the name of the model in the table of a TOML file.
+
+    Raises:
+        InputError: it is missing, or not in the folder of the TOML file.
+    """
+    name = table.get("model")
+    if not isinstance(name, str) or not name:
+        raise InputError(f"{path}: model is missing: the name of an MJCF or URDF beside this file")
+    if Path(name).name != name:
+        text = f"model must name a file beside it, got {short_repr(name)}"
+        raise InputError(f"{path}: {text}")
+    return name
 
 
 def read_description(path: Path) -> Description:
@@ -360,24 +311,23 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
     Raises:
         InputError: as `read_description`.
     """
-    file = from_table(str(path), _File, table)
+    if key := published_key(table):
+        text = f"{key} is of a model as published; hector robot {path} --out FOLDER converts it"
+        raise InputError(f"{path}: {text}")
+    file = from_table(str(path), _File, hector_names() | table)
     name = path.stem if file.name is None else file.name
     if not name.replace("-", "").replace("_", "").isalnum():
         text = "name must be letters, digits, - and _ (it names a folder)"
         raise InputError(f"{path}: {text}, got {short_repr(name)}")
     sections = {name: getattr(file, name) for name in CONTROL}
     return Description(
-        model=path.parent / file.model,
+        model=path.parent / model_name(path, table),
         path=path,
         name=name,
-        standing=_as_tuples(file.standing),
+        standing=file.standing,
         joints=sum(file.joints.legs.values(), ()),
         linkage=file.joints.linkage,
-        weld=file.joints.weld,
-        armature=file.joints.armature,
-        range=file.joints.range,
-        torque=file.joints.torque,
-        feet=tuple(file.feet.feet.values()) if file.feet else Description.feet,
+        feet=tuple(file.feet.feet.values()),
         **vars(file.limits),
         control=_as_tuples({name: x for name, x in sections.items() if x is not None}),
         nominal=file.weights.nominal and file.weights.nominal.rows(),
@@ -389,6 +339,29 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
     )
 
 
+def published_key(table: dict[str, Any]) -> str:
+    """Return the first key of a table that a robot in the standard form has not, "" if none."""
+    sections = (
+        ("joints", PUBLISHED),
+        *((f"feet.{leg}", ("body",)) for leg in sum(FEET.values(), ())),
+    )
+    keys = ["standing"] * isinstance(table.get("standing"), dict)
+    for name, own in sections:
+        section: Any = table
+        for part in name.split("."):
+            section = section.get(part, {}) if isinstance(section, dict) else {}
+        keys += [f"{name}.{key}" for key in own if isinstance(section, dict) and key in section]
+    return next(iter(keys), "")
+
+
+@cache
+def hector_names() -> dict[str, Any]:
+    """Return the part of HECTOR's table that a robot with its names may leave out."""
+    table = read_toml(DESCRIPTION_PATH, "the robot description", MAX_BYTES)
+    legs = {leg: table["joints"][leg] for leg in FEET[2]}
+    return {"joints": legs, "feet": table["feet"], "standing": table["standing"]}
+
+
 def _as_tuples(value: Any) -> Any:
     """Return the value with tuples for lists and dicts, hashable as static arguments must be."""
     if isinstance(value, dict):
@@ -396,5 +369,5 @@ def _as_tuples(value: Any) -> Any:
     return tuple(map(_as_tuples, value)) if isinstance(value, list | tuple) else value
 
 
-HECTOR = Description()
+HECTOR = read_description(DESCRIPTION_PATH)
 """The default robot, whose plants are drawn if no description is passed."""
