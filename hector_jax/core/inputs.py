@@ -117,11 +117,11 @@ def expect(path: Path, condition: Any, message: str) -> None:
         raise InputError(f"{path}: {message}")
 
 
-def require(path: Path, kind: str, name: str, names: Sequence[str]) -> None:
+def require(path: Path, kind: str, name: str, names: Sequence[str], remedy: str = "") -> None:
     """Raise InputError with the nearest name unless the name is one of the names."""
     if name not in names:  # the nearest name takes longer to find than all other checks
         text = f"no {kind} {name!r}{did_you_mean(name, names)}; {kind}s: {listed(names)}"
-        raise InputError(f"{path}: {text}")
+        raise InputError(f"{path}: {text}{remedy}")
 
 
 def listed(names: Sequence[str]) -> str:

@@ -49,7 +49,7 @@ class _Parts(NamedTuple):
     free: int  # joint, or -1
 
 
-def convert(file: File, draft: Draft, name: str) -> Standard:
+def to_standard(file: File, draft: Draft, name: str) -> Standard:
     """Convert a file with the names and numbers of a draft, all of which it has.
 
     Raises:

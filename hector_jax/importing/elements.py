@@ -78,7 +78,7 @@ def compile_bare(path: Path, root: ElementTree.Element, spec: mujoco.MjSpec) -> 
     bare = spec.copy()
     for part in (*bare.actuators, *bare.keys):
         bare.delete(part)
-    # welded bodies may have no mass; `convert` checks the masses of the merged links
+    # welded bodies may have no mass; `to_standard` checks the masses of the merged links
     bare.compiler.boundmass = MASSLESS
     bare.compiler.boundinertia = _NO_INERTIA
     with mujoco_errors(path, root):

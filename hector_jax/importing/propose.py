@@ -41,7 +41,7 @@ from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError, expect
 from hector_jax.core.settings import as_toml, from_table, read_toml
 from hector_jax.core.trajectory import FEET
-from hector_jax.importing.convert import Standard, convert, guessed_numbers, short
+from hector_jax.importing.convert import Standard, guessed_numbers, short, to_standard
 from hector_jax.importing.draft import PublishedJoints, draft_of
 from hector_jax.importing.elements import check_couplings, read_file
 from hector_jax.importing.meshes import resolved
@@ -123,7 +123,8 @@ def _stages(
     source, toml, own = path.parent / found.table["model"], path.with_suffix(".toml"), found.table
     with _told_of(source, model):
         if robot := _in_standard_form(path, own):
-            found = found._replace(table=hector_names() | own)
+            names = {key: x for key, x in hector_names().items() if key not in own}
+            found = found._replace(table=own | names)
         else:
             file, named = read_file(source), _named_legs(path, own)
             if not (named and "feet" in own and "standing" in own):
@@ -134,10 +135,12 @@ def _stages(
             joints, lines = guessed_numbers(file, draft)
             table = _merged({"joints": joints}, found.table)
             yield (found := found._replace(table=table, guesses=(*found.guesses, *lines)))
-            standard = convert(file, draft_of(toml, table), table["name"])
+            standard = to_standard(file, draft_of(toml, table), table["name"])
             write_file(model, standard.text.encode())
             found = found._replace(standard=standard)
-            robot = robot_of(_description(toml, found, model), checked=False)
+            names = {key: x for key, x in table.items() if key in _NAMES}
+            bare = _description(toml, found._replace(table=names), model)
+            robot = robot_of(bare, checked=False)
         found = found._replace(table=_merged(_settings(robot), found.table))
         description = _description(toml, found, model)
         yield found._replace(robot=robot._replace(description=description))
@@ -155,11 +158,10 @@ def _told_of(source: Path, model: Path) -> Iterator[None]:
 
 
 def _in_standard_form(path: Path, own: dict[str, Any]) -> Robot | None:
-    """Return the robot of a TOML file, None unless it is in the standard form."""
-    with suppress(InputError):
-        return (
-            robot_of(description_of(path, own), checked=False) if path.suffix == ".toml" else None
-        )
+    """Return the robot of a TOML file, None unless it is in the standard form and stands."""
+    if path.suffix == ".toml":
+        with suppress(InputError):
+            return robot_of(description_of(path, own))
     return None
 
 
@@ -269,7 +271,7 @@ def _merged(rules: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
         for key, value in rules.items()
         if isinstance(value, dict) and isinstance(own.get(key), dict)
     }
-    return {**{key: x for key, x in own.items() if key not in rules}, **rules, **own, **both}
+    return own | {key: x for key, x in rules.items() if key not in own} | both
 
 
 def _left_out(table: dict[str, Any], own: dict[str, Any], prefix: str = "") -> list[str]:

@@ -100,9 +100,9 @@ def rebuild(path: Path, draft: Draft, pieces: Pieces, name: str) -> str:
     for leg, (side, foot) in enumerate(zip(draft.legs, draft.soles, strict=True)):
         last = (leg + 1) * count
         link = pieces.links[last]
-        contacts, point = _sole(
-            path, foot, pieces, link, f"feet.{side}", draft.leg_joints[last - 1]
-        )
+        text = f"feet.{side}.body is {foot.body!r}, expected one that joint "
+        text += f"{draft.leg_joints[last - 1]!r} moves: "
+        contacts, point = _sole(path, foot, pieces, link, text)
         heights += (pieces.standing(link).p + contacts @ pieces.standing(link).R.T)[:, 2].tolist()
         _add_foot(bodies[last], side, contacts, point, pieces.up(link))
     for joint, limit in zip(draft.leg_joints, pieces.limits, strict=True):
@@ -249,18 +249,16 @@ def _add_stick(
 
 
 def _sole(
-    path: Path, foot: PublishedFoot, pieces: Pieces, link: Link, key: str, joint: str
+    path: Path, foot: PublishedFoot, pieces: Pieces, link: Link, expected: str
 ) -> tuple[Float[np.ndarray, "c 3"], Float[np.ndarray, "3"]]:
     """Return contacts of a foot, and where wrenches act, in the frame of its link [m]."""
     model = pieces.file.model
-    names = {model.body(b).name: pose for b, pose in link.bodies.items()}
     if foot.body is not None:
-        text = f"{key}.body is {foot.body!r}, expected one that joint {joint!r} moves: "
-        expect(path, foot.body in names, text + ", ".join(names))
-        pose = names[foot.body]
-        contacts = np.array([pose.p + pose.R @ np.array(x) for x in foot.places])
-        own = foot.point is not None
-        return contacts, pose.p + pose.R @ np.array(foot.point) if own else contacts.mean(axis=0)
+        names = {model.body(b).name: pose for b, pose in link.bodies.items()}
+        expect(path, foot.body in names, expected + ", ".join(names))
+        R, p = names[foot.body]
+        contacts = p + np.array(foot.places, float) @ R.T
+        return contacts, contacts.mean(axis=0) if foot.point is None else p + R @ foot.point
     spheres = {
         model.geom(g).name: link.bodies[b].p
         + link.bodies[b].R @ model.geom_pos[g]

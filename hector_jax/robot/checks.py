@@ -20,7 +20,7 @@ from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, expect, listed, require
 from hector_jax.core.trajectory import FEET
 from hector_jax.robot.description import Description
-from hector_jax.robot.mjcf import TIME_STEP
+from hector_jax.robot.mjcf import TIME_STEP, convert_by
 from hector_jax.robot.poses import lowest_points, standing_data, trunk_body
 
 _TOLERANCE = 1e-4  # [m]: between the contacts of different feet; angles in files have few digits
@@ -39,48 +39,23 @@ SOLVER = {
 """The options of every robot, by name in MuJoCo."""
 
 
-def convert_by(path: Path) -> str:
-    """Return the words that name the command which brings a file into the standard form."""
-    return f"convert it once: hector robot {path} --out FOLDER"
-
-
-def check_model(description: Description, model: mujoco.MjModel) -> None:
-    """Check a compiled model.
-
-    Raises:
-        InputError: one line with the value received, the expected one and the possible names.
-    """
-    path = description.model
-    sites = [model.site(i).name for i in range(model.nsite)]
-    geoms = [model.geom(i).name for i in range(model.ngeom)]
-    last_joints = description.joints[description.leg_joints - 1 :: description.leg_joints]
-    for foot, joint in zip(description.feet, last_joints, strict=True):
-        require(path, "site", foot.point, sites)
-        body = model.joint(joint).bodyid[0]
-        name = model.body(body).name
-        on_foot = model.site(foot.point).bodyid[0] == body
-        expect(path, on_foot, f"site {foot.point!r} is not on the foot, body {name!r}")
-        for contact in foot.contacts:
-            require(path, "geom", contact, geoms)
-            geom = model.geom(contact)
-            valid = geom.bodyid[0] == body and geom.type[0] == mujoco.mjtGeom.mjGEOM_SPHERE
-            expect(path, valid, f"geom {contact!r} is not a sphere on body {name!r}")
-    _check_standing(description, model)
-
-
 def check_form(description: Description, model: mujoco.MjModel) -> None:
-    """Check that a compiled model has the standard form.
+    """Check that a compiled model has the standard form, with the names of a description.
 
     Raises:
-        InputError: one line says what it has not, and the command that converts it.
+        InputError: one line with a name that it has not and the possible ones; or what it has not
+            of the form, and the command that converts it.
     """
-    path, names = description.model, [model.joint(j).name for j in range(model.njnt)]
-    for name in description.joints:
-        require(path, "joint", name, names)
-    require(path, "keyframe", description.standing, [model.key(i).name for i in range(model.nkey)])
+    path, remedy = description.model, f"; {convert_by(description.path)}"
+    named = [("keyframe", description.standing, model.key, model.nkey)]
+    named += [("joint", name, model.joint, model.njnt) for name in description.joints]
+    for foot in description.feet:
+        named.append(("site", foot.point, model.site, model.nsite))
+        named += [("geom", name, model.geom, model.ngeom) for name in foot.contacts]
+    for kind, name, part, count in named:
+        require(path, kind, name, [part(i).name for i in range(count)], remedy)
     for text in (*_not_of_robot(description, model), *_not_of_world(description, model)):
-        text = f"not in the standard form: {text}; {convert_by(description.path)}"
-        raise InputError(f"{path}: {text}")
+        raise InputError(f"{path}: not in the standard form: {text}{remedy}")
 
 
 def _not_of_robot(description: Description, model: mujoco.MjModel) -> Iterator[str]:
@@ -118,6 +93,15 @@ def _not_of_robot(description: Description, model: mujoco.MjModel) -> Iterator[s
         and np.all((force == span) | (model.actuator_forcelimited[:, None] == 0))
     ):
         yield "expected a motor of torque for each joint in their order, with a ctrlrange"
+    last_bodies = model.jnt_bodyid[count::count]
+    for foot, body in zip(description.feet, last_bodies, strict=True):
+        contacts = [model.geom(name) for name in foot.contacts]
+        spheres = all(x.type[0] == mujoco.mjtGeom.mjGEOM_SPHERE for x in contacts)
+        if {body} != {
+            part.bodyid[0] for part in (model.site(foot.point), *contacts)
+        } or not spheres:
+            parts = listed((foot.point, *foot.contacts))
+            yield f"expected a site and spheres on body {model.body(body).name!r}, got {parts}"
 
 
 def _not_of_world(description: Description, model: mujoco.MjModel) -> Iterator[str]:
@@ -145,7 +129,7 @@ def _not_of_world(description: Description, model: mujoco.MjModel) -> Iterator[s
             yield f"contact bits or friction of geom {model.geom(g).name!r}"
     for name, value in SOLVER.items():
         if (own := getattr(model.opt, name)) != value:
-            yield f"option {name} is {own:g}, expected {value:g}"
+            yield f"option {name} is {own}, expected {float(value):g}"
     gravity = model.opt.gravity
     if np.any(gravity[:2]) or not gravity[2] < 0.0:
         yield f"gravity is {gravity}, expected 0 0 and a negative number"
@@ -189,8 +173,12 @@ def check_soles(path: Path, contacts: Float[np.ndarray, "feet c 3"]) -> None:
         expect(path, same, f"{text}, expected the same")
 
 
-def _check_standing(description: Description, model: mujoco.MjModel) -> None:
-    """Check that the standing pose is on the floor, balanced, within limits and can be held."""
+def check_standing(description: Description, model: mujoco.MjModel) -> None:
+    """Check that the standing pose is on the floor, balanced, within limits and can be held.
+
+    Raises:
+        InputError: one line with the value received and the expected one.
+    """
     path, data = description.model, standing_data(description, model)
     key = f"keyframe {description.standing!r}"
     for name in description.joints:
@@ -206,7 +194,7 @@ def _check_standing(description: Description, model: mujoco.MjModel) -> None:
     text = "standing, the soles are not level: contacts above the lowest one [mm]: "
     text += f"{', '.join(offsets)}; expected at most {1e3 * ON_FLOOR:g}: change the standing angles"
     expect(path, max(heights) - low <= ON_FLOOR, text)
-    text = f"{key} has the soles {low:.4g} m above the floor, expected 0"
+    text = f"{key} has the soles {low:.4g} m above the floor; {convert_by(description.path)}"
     expect(path, abs(low) <= ON_FLOOR, text)
     for contact in data.contact:
         bodies = model.geom_bodyid[contact.geom]

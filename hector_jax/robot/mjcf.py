@@ -59,18 +59,28 @@ _MEMORY = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30}
 _MOST_MEMORY = 2**30
 
 
-def read_mjcf(path: Path) -> ElementTree.Element:
+def convert_by(path: Path) -> str:
+    """Return the words that name the command which brings a file into the standard form."""
+    return f"convert it once: hector robot {path} --out FOLDER"
+
+
+def read_mjcf(path: Path, toml: Path) -> ElementTree.Element:
     """Read the elements of an MJCF that is safe to open with MuJoCo and needs no other file.
+
+    Args:
+        path: of the file.
+        toml: that names it.
 
     Raises:
         InputError: one line naming the file and the first error in it.
     """
     root = read_elements(path)
-    expect(path, root.tag == "mujoco", f"root element is <{root.tag[:40]}>, expected <mujoco>")
+    text = f"root element is <{root.tag[:40]}>, expected <mujoco>; {convert_by(toml)}"
+    expect(path, root.tag == "mujoco", text)
     for element in root.iter():
         files = [name for name in element.attrib if name.startswith("file")]
         named = f" of {short_repr(element.get(files[0]))}" if files else ""
-        text = f"<{element.tag}>{named} is of another file"
+        text = f"<{element.tag}>{named} is of another file; {convert_by(toml)}"
         expect(path, not files and element.tag != "include", text)
     check_elements(path, root)
     return root

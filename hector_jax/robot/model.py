@@ -21,9 +21,9 @@ from scipy.spatial.transform import Rotation
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, one_line
-from hector_jax.robot.checks import check_form, check_model, check_soles, convert_by
+from hector_jax.robot.checks import check_form, check_soles, check_standing
 from hector_jax.robot.description import HECTOR, Description, read_description
-from hector_jax.robot.mjcf import mujoco_errors, read_mjcf, text_of
+from hector_jax.robot.mjcf import convert_by, mujoco_errors, read_mjcf, text_of
 from hector_jax.robot.poses import data_at, inertia_about, standing_data, trunk_body
 
 _CLOSED_AXES = np.eye(3)[[2, 0, 1, 1, 1]]  # yaw, roll, hip pitch, knee, ankle
@@ -184,7 +184,7 @@ def compile_model(description: Description) -> mujoco.MjModel:
         InputError: as `build_model`.
     """
     build_model(description)
-    return _read_spec(description.model)[1].compile()
+    return _read_spec(description)[1].compile()
 
 
 def build_model(
@@ -201,10 +201,10 @@ def build_model(
 
     Raises:
         InputError: one line with the value received, the expected one and the possible names, from
-            `mjcf.read_mjcf`, MuJoCo, `checks.check_form` or `checks.check_model`.
+            `mjcf.read_mjcf`, MuJoCo, `checks.check_form` or `checks.check_standing`.
     """
     with conversion(description.model):
-        root, spec = _read_spec(description.model)
+        root, spec = _read_spec(description)
         for geom in spec.geoms:
             geom.material = ""
         for picture in (*spec.materials, *spec.textures):
@@ -213,13 +213,13 @@ def build_model(
             model = spec.compile()
         check_form(description, model)
         if checked:
-            check_model(description, model)
+            check_standing(description, model)
     return spec, model
 
 
-def _read_spec(path: Path) -> tuple[ElementTree.Element, mujoco.MjSpec]:
-    root = read_mjcf(path)
-    with mujoco_errors(path, root):
+def _read_spec(description: Description) -> tuple[ElementTree.Element, mujoco.MjSpec]:
+    root = read_mjcf(description.model, description.path)
+    with mujoco_errors(description.model, root):
         return root, mujoco.MjSpec.from_string(text_of(root))
 
 
