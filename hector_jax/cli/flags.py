@@ -29,7 +29,7 @@ class PathKind(Enum):
     SETS = "nominal, expert, best, a weights file, or a folder of one for each trajectory"
     TRAJECTORY = "a name or a TOML file"
     MODEL = "light, heavy or a TOML file of a robot"
-    ROBOT = "a TOML file that names an MJCF: hector robot MODEL --out NAME.toml makes one"
+    ROBOT = "a robot's TOML file: hector robot MODEL --out FOLDER makes one"
 
 
 def named_file(text: str) -> tuple[str, str]:
