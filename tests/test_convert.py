@@ -67,8 +67,8 @@ def test_a_model_without_the_form_names_the_command_that_brings_it_there(tmp_pat
     path.write_text(DESCRIPTION_PATH.read_text())
     model = replaced(MODEL_PATH.read_text(), NOT_STANDARD[words])
     (tmp_path / "hector.xml").write_text(model)
-    command = f"convert it once: hector robot {path} --out FOLDER"
-    with pytest.raises(InputError, match=f"standard form: {words}.*; {re.escape(command)}$"):
+    command = f"converted once, by hector robot {path} --out FOLDER"
+    with pytest.raises(InputError, match=f"standard form: {words}.* {re.escape(command)}$"):
         load_robot(path)
     for other in (MODEL_PATH, EXAMPLES / "quadruped" / "quadruped.xml"):
         with pytest.raises(InputError, match=f"hector robot {other} --out FOLDER$"):

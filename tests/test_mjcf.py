@@ -144,7 +144,11 @@ FOUR = {
     "feet": {leg: {"body": f"{leg}_calf", "contacts": [[-0.01, 0, -0.2326]]} for leg in LEGS},
 }
 OF_TABLE = {  # a change of a TOML of the quadruped as it is published
-    f"{HEAD}front_left, front_right, hind_left$": (r"(?s)\[feet.hind_right\].*", ""),
+    f"{HEAD}front_left, front_right, hind_left$": (r"hind_right = \[.*\n", ""),
+    "expected them in feet, got front_left, front_right, hind_left$": (
+        r"(?s)\[feet.hind_right\].*",
+        "",
+    ),
     "joints: must have .* got left, fr": (r"\[joints\]", r'\g<0>\nleft = ["a", "b", "c"]'),
     "feet.hind_left.body is 'front_left_calf', expected one that joint 'hind_left_knee'": (
         BODY,
@@ -180,11 +184,14 @@ OF_STRIDER = {  # a change of the strider's TOML
     r"nominal: euler must be a number.*got \[50, 0": ("l.euler = 50", "l.euler = [50, 0, 50]"),
     "robot.toml: model is missing.*MJCF or URDF beside": ('model = "strider.xml"', ""),
     "expert: missing field 'moment'": ("expert.moment = 1.8e-3", ""),
-    "robot.toml: joints.weld is of a model as published; hector robot .* converts it": (
+    "unknown field 'weld'.* a robot as published is converted once, by hector robot .*/robot.toml": (
         "[joints]",
         '[joints]\nweld = ["waist"]',
     ),
-    "feet.left.body is of a model as": ('left = { point = "left_sole"', 'left = { body = "a"'),
+    "feet.left: unknown field 'body'.*by hector robot": (
+        'left = { point = "left_sole"',
+        'left = { body = "a"',
+    ),
     "no site 'left_soul'.*did you mean 'left_sole'?": ('"left_sole"', '"left_soul"'),
 }
 

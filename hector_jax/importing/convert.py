@@ -16,7 +16,7 @@ from hector_jax.core.inputs import did_you_mean, expect, listed, require
 from hector_jax.importing.draft import Draft
 from hector_jax.importing.elements import File
 from hector_jax.importing.links import Link, links_of, subtree
-from hector_jax.importing.rebuild import Pieces, contact_name, point_name, rebuild
+from hector_jax.importing.rebuild import Pieces, rebuild
 from hector_jax.robot.poses import data_at
 
 _JOINT = mujoco.mjtJoint
@@ -73,14 +73,7 @@ def to_standard(file: File, draft: Draft, name: str) -> Standard:
     _check_links(parts, links)
     standing = data_at(model, angles)
     pieces = Pieces(standing, links, [*limits.values()], trunk_quat)
-    text = rebuild(file.path, draft, pieces, name)
-    feet = {
-        leg: {
-            "point": point_name(leg),
-            "contacts": [contact_name(leg, i) for i in range(len(foot.places))],
-        }
-        for leg, foot in zip(draft.legs, draft.soles, strict=True)
-    }
+    text, feet = rebuild(file.path, draft, pieces, name)
     return Standard(text, feet, (*file.notes, *_changes(parts)), standing, links)
 
 
@@ -91,7 +84,7 @@ def guessed_numbers(file: File, draft: Draft) -> tuple[dict[str, Any], list[str]
         Range and torque, of which the file has none for some joint, and armature; a line for each
         guess.
     """
-    parts, count, joints, lines = _parts(file, draft), len(draft.joints.legs[draft.legs[0]]), {}, []
+    parts, count, joints, lines = _parts(file, draft), draft.count, {}, []
     model = file.model
     if (without := _without_range(parts)) and not draft.joints.range:
         joints["range"] = [[-_HALF_TURN, _HALF_TURN]] * count
@@ -130,7 +123,7 @@ def short(x: float) -> float:
 def _parts(file: File, draft: Draft) -> _Parts:
     """Find the robot in a file."""
     path, model, names = file.path, file.model, file.joints
-    for joint in (*draft.leg_joints, *draft.joints.weld):
+    for joint in (*draft.all_joints, *draft.joints.weld):
         require(path, "joint", joint, names)
     for motor in _motors(file):
         text = f"actuator {motor.name!r} drives no joint {motor.target!r}"
@@ -140,7 +133,7 @@ def _parts(file: File, draft: Draft) -> _Parts:
     expect(path, len(free) < 2, text)
     fixed = [names[j] for j in free if names[j] in draft.joints.weld]
     expect(path, not fixed, f"weld names {listed(fixed)}, the free joint, expected hinges")
-    joints = [names.index(joint) for joint in draft.leg_joints]
+    joints = [names.index(joint) for joint in draft.all_joints]
     first_body = model.jnt_bodyid[joints[0]]
     trunk = int(model.jnt_bodyid[free[0]] if free else model.body_rootid[first_body])
     return _Parts(file, draft, trunk, joints, free[0] if free else -1)
@@ -203,7 +196,7 @@ def _standing(parts: _Parts) -> tuple[dict[int, float], Float[np.ndarray, "4"]]:
     """Return each hinge's and slide's standing angle [rad] by joint, and the trunk's quaternion."""
     draft, (path, root, spec, model, _) = parts.draft, parts.file
     pose, trunk_quat = draft.standing, np.array([1.0, 0.0, 0.0, 0.0])
-    names = (*draft.leg_joints, *draft.joints.weld)
+    names = (*draft.all_joints, *draft.joints.weld)
     hinges = {name: parts.file.joints.index(name) for name in names}
     if not isinstance(pose, str):
         for name in pose:
@@ -229,7 +222,7 @@ def _stated_limits(parts: _Parts) -> dict[str, float]:
     itself (effort in a URDF).
     """
     model, torques = parts.file.model, {}
-    for joint, name in zip(parts.joints, parts.draft.leg_joints, strict=True):
+    for joint, name in zip(parts.joints, parts.draft.all_joints, strict=True):
         limited = model.jnt_actfrclimited[joint]
         torques[name] = [np.abs(model.jnt_actfrcrange[joint]).min()] if limited else []
     for motor in _motors(parts.file):
@@ -285,8 +278,7 @@ def _changes(parts: _Parts) -> list[str]:
 
 def _check_links(parts: _Parts, links: Sequence[Link]) -> None:
     """Check that each leg is a chain from the trunk down and that each link has a mass."""
-    path, names = parts.file.path, parts.draft.leg_joints
-    count = len(names) // len(parts.draft.legs)
+    path, names, count = parts.file.path, parts.draft.all_joints, parts.draft.count
     for index, link in enumerate(links):
         text = f"body {link.name!r} moves and has no mass: give it an <inertial>"
         expect(path, link.mass > 0.0, text)

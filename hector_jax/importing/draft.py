@@ -11,6 +11,9 @@ Beside the keys of the standard form it has
     left, right = { body, contacts = [[x, y, z], ...], point = [x, y, z] }   # 1, 2 or 4 contacts
 """
 
+# pyright: reportIncompatibleVariableOverride=false
+# a draft may have more than the standard form has
+
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +21,7 @@ from typing import Annotated, Any
 
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import NOT_NEGATIVE, POSITIVE, from_table
-from hector_jax.core.trajectory import FEET
-from hector_jax.robot.description import Joints, Triple, by_leg
+from hector_jax.robot.description import Joints, NamedFoot, Names, Triple
 
 
 @dataclass(frozen=True)
@@ -33,8 +35,9 @@ class PublishedJoints(Joints):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        count, own = len(next(iter(self.legs.values()))), sum(self.legs.values(), ())
-        if twice := {*own} & {*self.weld}:
+        names = sum(self.legs.values(), ())
+        count = len(names) // len(self.legs)
+        if twice := {*names} & {*self.weld}:
             raise InputError(f"must be different names, got {short_repr(min(twice))} twice")
         for name in ("armature", "range", "torque"):
             if len(value := getattr(self, name)) not in (0, count):
@@ -45,78 +48,46 @@ class PublishedJoints(Joints):
 
 
 @dataclass(frozen=True)
-class PublishedFoot:
-    """A foot by names of a site and of spheres, or by points in the frame of a body."""
+class PublishedFoot(NamedFoot):
+    """A foot by names, or by points in the frame of a body."""
 
-    body: str | None = None
-    contacts: tuple[str | Triple, ...] = ()  # spheres; or points on the sole [m]
     point: str | Triple | None = None  # site; or where wrenches act [m]; None: middle of contacts
-    toe: str | None = None
-    heel: str | None = None
-
-    @property
-    def places(self) -> tuple[str | Triple, ...]:
-        """Its spheres or points."""
-        ends = () if self.toe is None or self.heel is None else (self.toe, self.heel)
-        return ends or self.contacts
+    contacts: tuple[str | Triple, ...] = ()  # spheres; or points on the sole [m]
+    body: str | None = None
 
     def __post_init__(self) -> None:
-        named = [isinstance(x, str) for x in (*self.places, self.point)]
-        if self.body is None:
-            valid = all(named)
-        else:
-            points = [*self.places, *(x for x in (self.point,) if x is not None)]
-            valid = not any(named) and all(math.isfinite(float(x)) for at in points for x in at)
-        ends = self.toe is not None or self.heel is not None
-        if not valid or len(self.places) not in (1, 2, 4) or (self.contacts and ends):
+        super().__post_init__()
+        named = [isinstance(x, str) for x in (*self.places, self.point) if x is not None]
+        points = () if any(named) else (*self.contacts, self.point or (0.0, 0.0, 0.0))
+        finite = all(math.isfinite(float(x)) for point in points for x in point)
+        by_names = all(named) and self.point is not None
+        if not (by_names if self.body is None else finite and not any(named)):
             raise InputError(
-                "must be names: point (a site) and toe and heel (spheres), or point and 1, 2 or 4 "
-                "contacts (spheres); or a body with 1, 2 or 4 contacts [x, y, z] on its sole and, "
-                "if wanted, a point [x, y, z]"
+                "must be a body with 1, 2 or 4 contacts [x, y, z] on its sole and, if wanted, a "
+                "point [x, y, z]; or names alone"
             )
 
 
 @dataclass(frozen=True)
-class _Feet:
-    left: PublishedFoot | None = None
-    right: PublishedFoot | None = None
-    front_left: PublishedFoot | None = None
-    front_right: PublishedFoot | None = None
-    hind_left: PublishedFoot | None = None
-    hind_right: PublishedFoot | None = None
-
-
-@dataclass(frozen=True)
-class Draft:
+class Draft(Names):
     """Names and numbers with which a file is converted."""
 
     joints: PublishedJoints
-    feet: _Feet
+    feet: dict[str, PublishedFoot]
     standing: str | dict[str, float] = "standing"
-
-    @property
-    def leg_joints(self) -> tuple[str, ...]:
-        """Joints of all legs, leg by leg."""
-        return sum(self.joints.legs.values(), ())
 
     @property
     def legs(self) -> tuple[str, ...]:
         """Names of the legs."""
-        return FEET[len(self.joints.legs)]
+        return tuple(self.joints.legs)
 
     @property
-    def soles(self) -> tuple[PublishedFoot, ...]:
-        """Feet in the order of the legs."""
-        return tuple(by_leg(self.feet, None).values())
+    def count(self) -> int:
+        """Number of joints of a leg."""
+        return len(self.all_joints) // len(self.legs)
 
     def __post_init__(self) -> None:
-        feet = by_leg(self.feet, None)
-        if self.legs != tuple(feet):
-            text = f"joints has the legs {', '.join(self.legs)}, expected them in feet"
-            raise InputError(f"{text}, got {', '.join(feet)}")
-        counts = [len(foot.places) for foot in self.soles]
-        if len(set(counts)) > 1:
-            raise InputError(f"{' and '.join(feet)} must have as many contacts, got {counts}")
+        super().__post_init__()
         angles = self.standing.values() if isinstance(self.standing, dict) else ()
         if not all(map(math.isfinite, angles)):
             raise InputError(f"standing must be finite angles, got {short_repr(self.standing)}")

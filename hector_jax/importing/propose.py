@@ -31,7 +31,7 @@ of mass m and height h:
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,8 +50,8 @@ from hector_jax.importing.stand import standing_pose
 from hector_jax.importing.survey import Survey, survey_file
 from hector_jax.robot.description import (
     MAX_BYTES,
-    PUBLISHED,
     Description,
+    Joints,
     description_of,
     hector_names,
     model_name,
@@ -131,7 +131,7 @@ def _stages(
                 yield (found := _with_legs(survey_file(file, named, (*weld, *_welded(own))), found))
                 yield (found := _with_feet(found, wrong))
             draft = draft_of(toml, found.table)
-            check_couplings(file, draft.leg_joints, draft.joints.weld)
+            check_couplings(file, draft.all_joints, draft.joints.weld)
             joints, lines = guessed_numbers(file, draft)
             table = _merged({"joints": joints}, found.table)
             yield (found := found._replace(table=table, guesses=(*found.guesses, *lines)))
@@ -175,7 +175,8 @@ def _standard_table(found: RobotProposal) -> dict[str, Any]:
     """Return the TOML table of a proposed robot in the standard form."""
     if found.standard is None:
         return found.table
-    joints = {key: x for key, x in found.table["joints"].items() if key not in PUBLISHED}
+    own = {field.name for field in fields(Joints)}
+    joints = {key: x for key, x in found.table["joints"].items() if key in own}
     names = {"name": found.table["name"], "model": MODEL, "standing": "standing", "joints": joints}
     names["feet"] = found.standard.feet
     return names | {key: x for key, x in found.table.items() if key not in names}

@@ -73,8 +73,8 @@ class Pieces(NamedTuple):
         return pose_of(np.zeros(3), self.trunk_quat) @ frames[0].to(frames[1])
 
 
-def rebuild(path: Path, draft: Draft, pieces: Pieces, name: str) -> str:
-    """Return the MJCF of a robot in the standard form.
+def rebuild(path: Path, draft: Draft, pieces: Pieces, name: str) -> tuple[str, dict[str, Any]]:
+    """Return the MJCF of a robot in the standard form, and the section [feet] of its TOML.
 
     Args:
         path: of the file, for messages.
@@ -89,23 +89,24 @@ def rebuild(path: Path, draft: Draft, pieces: Pieces, name: str) -> str:
     world = root.find("worldbody")
     assert world is not None
     contact, motors, keys = (_add(root, tag) for tag in ("contact", "actuator", "keyframe"))
-    count, bodies = len(draft.leg_joints) // len(draft.legs), []
+    count, bodies = draft.count, []
     for index, link in enumerate(pieces.links):
         bodies.append(_add_link(bodies[link.parent] if bodies else world, pieces, link))
         leg = None if index == 0 else (index - 1) // count
         bits = contact_bits(len(draft.legs), leg, on_floor=index % count > 0 or index == 0)
         _add_geoms(pieces, index, bodies[-1], bits)
     _add_sticks(pieces, bodies)
-    heights = []
-    for leg, (side, foot) in enumerate(zip(draft.legs, draft.soles, strict=True)):
+    heights, feet = [], {}
+    for leg, side in enumerate(draft.legs):
+        foot = draft.feet[side]
         last = (leg + 1) * count
         link = pieces.links[last]
         text = f"feet.{side}.body is {foot.body!r}, expected one that joint "
-        text += f"{draft.leg_joints[last - 1]!r} moves: "
+        text += f"{draft.all_joints[last - 1]!r} moves: "
         contacts, point = _sole(path, foot, pieces, link, text)
         heights += (pieces.standing(link).p + contacts @ pieces.standing(link).R.T)[:, 2].tolist()
-        _add_foot(bodies[last], side, contacts, point, pieces.up(link))
-    for joint, limit in zip(draft.leg_joints, pieces.limits, strict=True):
+        feet[side] = _add_foot(bodies[last], side, contacts, point, pieces.up(link))
+    for joint, limit in zip(draft.all_joints, pieces.limits, strict=True):
         span = [-limit, limit]
         _add(motors, "motor", name=joint, joint=joint, ctrlrange=span, forcerange=span)
     _add_excludes(contact, pieces)
@@ -115,17 +116,7 @@ def rebuild(path: Path, draft: Draft, pieces: Pieces, name: str) -> str:
     bodies[0].set("pos", _text(place))
     _add(keys, "key", name="standing", qpos=[*place, *pieces.trunk_quat, *angles])
     ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="unicode") + "\n"
-
-
-def point_name(leg: str) -> str:
-    """Return the name of the site on a foot."""
-    return f"{leg}_point"
-
-
-def contact_name(leg: str, index: int) -> str:
-    """Return the name of a sphere on a foot."""
-    return f"{leg}_contact_{index}"
+    return ElementTree.tostring(root, encoding="unicode") + "\n", feet
 
 
 def _add(parent: ElementTree.Element, tag: str, **values: Any) -> ElementTree.Element:
@@ -283,19 +274,14 @@ def _add_foot(
     contacts: Float[np.ndarray, "c 3"],
     point: Float[np.ndarray, "3"],
     up: Float[np.ndarray, "3"],
-) -> None:
-    """Add the site and the spheres whose lowest points, standing, are the contacts."""
-    for contact in contacts + _RADIUS * up:
-        _add_stick(body, contacts.mean(axis=0) + _RADIUS * up, contact, _RADIUS)
-    fields = {**_ROBOT_GEOM, **_FLOOR_BITS, "group": 2, "rgba": _DARK}
-    for i, contact in enumerate(contacts + _RADIUS * up):
-        _add(
-            body,
-            "geom",
-            name=contact_name(leg, i),
-            type="sphere",
-            size=_RADIUS,
-            pos=contact,
-            **fields,
-        )
-    _add(body, "site", name=point_name(leg), pos=point, size=0.005, group=4)
+) -> dict[str, Any]:
+    """Add a site, and spheres whose lowest points, standing, are the contacts; return its TOML."""
+    places = contacts + _RADIUS * up
+    for place in places:
+        _add_stick(body, places.mean(axis=0), place, _RADIUS)
+    fields = {"size": _RADIUS, **_ROBOT_GEOM, **_FLOOR_BITS, "group": 2, "rgba": _DARK}
+    names = [f"{leg}_contact_{i}" for i in range(len(places))]
+    for name, place in zip(names, places, strict=True):
+        _add(body, "geom", name=name, type="sphere", pos=place, **fields)
+    _add(body, "site", name=f"{leg}_point", pos=point, size=0.005, group=4)
+    return {"point": f"{leg}_point", "contacts": names}

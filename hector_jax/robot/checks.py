@@ -19,8 +19,8 @@ from jaxtyping import Float
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, expect, listed, require
 from hector_jax.core.trajectory import FEET
-from hector_jax.robot.description import Description
-from hector_jax.robot.mjcf import TIME_STEP, convert_by
+from hector_jax.robot.description import Description, convert_by
+from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.poses import lowest_points, standing_data, trunk_body
 
 _TOLERANCE = 1e-4  # [m]: between the contacts of different feet; angles in files have few digits

@@ -45,8 +45,6 @@ DESCRIPTION_PATH = _ASSETS / "hector.toml"
 FEWEST_JOINTS, MOST_JOINTS = 3, 7  # of a leg
 CONTROL = ("gait", "mpc", "slip", "footstep", "legs", "twin")  # sections that the controller reads
 
-PUBLISHED = ("weld", "armature", "range", "torque")  # keys of joints that are not in this form
-
 MAX_BYTES = 100_000
 
 Triple = tuple[float, float, float]
@@ -130,20 +128,6 @@ class Description:
         return len(self.joints) // len(self.feet)
 
 
-def by_leg(section: Any, default: Any) -> dict[str, Any]:
-    """Return the values of a section that are not the default, by leg in the order of FEET.
-
-    Raises:
-        InputError: the section has too few or too many legs.
-    """
-    legs = sum(FEET.values(), ())
-    values = {leg: value for leg in legs if (value := getattr(section, leg)) != default}
-    if tuple(values) not in FEET.values():
-        expected = "; or ".join(map(", ".join, FEET.values()))
-        raise InputError(f"must have {expected}, got {', '.join(values) or 'none of them'}")
-    return values
-
-
 @dataclass(frozen=True)
 class Joints:
     """The section [joints] of a file."""
@@ -158,10 +142,14 @@ class Joints:
 
     @property
     def legs(self) -> dict[str, tuple[str, ...]]:
-        """Joints by leg."""
-        return by_leg(self, ())
+        """Joints by leg, in the order of FEET."""
+        legs = sum(FEET.values(), ())
+        return {leg: joints for leg in legs if (joints := getattr(self, leg))}
 
     def __post_init__(self) -> None:
+        if tuple(self.legs) not in FEET.values():
+            expected = "; or ".join(map(", ".join, FEET.values()))
+            raise InputError(f"must have {expected}, got {', '.join(self.legs) or 'none of them'}")
         names = sum(self.legs.values(), ())
         counts = [len(joints) for joints in self.legs.values()]
         count = counts[0]
@@ -181,45 +169,49 @@ class Joints:
 
 
 @dataclass(frozen=True)
-class _Foot:
+class NamedFoot:
+    """A foot in the section [feet]."""
+
     point: str
+    contacts: tuple[str, ...] = ()
     toe: str | None = None
     heel: str | None = None
-    contacts: tuple[str, ...] = ()
+
+    @property
+    def places(self) -> tuple[str, ...]:
+        """Its contacts, of which toe and heel are two."""
+        return self.contacts or tuple(x for x in (self.toe, self.heel) if x is not None)
 
     def __post_init__(self) -> None:
-        ends = self.toe is not None or self.heel is not None
-        if len(self.foot.contacts) not in (1, 2, 4) or (ends and self.contacts):
+        both = self.contacts and (self.toe is not None or self.heel is not None)
+        if both or len(self.places) not in (1, 2, 4):
             raise InputError(
                 "must be names: point (a site) and toe and heel (spheres), or point and 1, 2 or 4 "
                 "contacts (spheres)"
             )
 
-    @property
-    def foot(self) -> Foot:
-        """The foot in the form of the description."""
-        ends = () if self.toe is None or self.heel is None else (self.toe, self.heel)
-        return Foot(self.point, ends or self.contacts)
-
 
 @dataclass(frozen=True)
-class _Feet:
-    left: _Foot | None = None
-    right: _Foot | None = None
-    front_left: _Foot | None = None
-    front_right: _Foot | None = None
-    hind_left: _Foot | None = None
-    hind_right: _Foot | None = None
+class Names:
+    """The part of a file that names what its model has."""
+
+    joints: Joints
+    feet: dict[str, NamedFoot]
+    standing: str
 
     @property
-    def feet(self) -> dict[str, Foot]:
-        """Feet by leg."""
-        return {leg: foot.foot for leg, foot in by_leg(self, None).items()}
+    def all_joints(self) -> tuple[str, ...]:
+        """Joints, leg by leg."""
+        return sum(self.joints.legs.values(), ())
 
     def __post_init__(self) -> None:
-        counts = [len(foot.contacts) for foot in self.feet.values()]
+        legs = self.joints.legs
+        if {*self.feet} != {*legs}:
+            text = f"joints has the legs {', '.join(legs)}, expected them in feet"
+            raise InputError(f"{text}, got {', '.join(self.feet)}")
+        counts = [len(self.feet[leg].places) for leg in legs]
         if len(set(counts)) > 1:
-            raise InputError(f"{' and '.join(self.feet)} must have as many contacts, got {counts}")
+            raise InputError(f"{' and '.join(legs)} must have as many contacts, got {counts}")
 
 
 @dataclass(frozen=True)
@@ -253,9 +245,6 @@ class _Weights:
 
 @dataclass(frozen=True)
 class _File:
-    joints: Joints
-    feet: _Feet
-    standing: str
     name: str | None = None
     model: str = ""
     limits: _Limits = _Limits()
@@ -270,11 +259,6 @@ class _File:
     tuning: TuningSettings = TuningSettings()
     plants: PlantSizes = PlantSizes()
     numbers: dict[str, dict] | None = None
-
-    def __post_init__(self) -> None:
-        if tuple(self.joints.legs) != tuple(self.feet.feet):
-            text = f"joints has the legs {', '.join(self.joints.legs)}, expected them in feet"
-            raise InputError(f"{text}, got {', '.join(self.feet.feet)}")
 
 
 def model_name(path: Path, table: dict[str, Any]) -> str:
@@ -311,10 +295,13 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
     Raises:
         InputError: as `read_description`.
     """
-    if key := published_key(table):
-        text = f"{key} is of a model as published; hector robot {path} --out FOLDER converts it"
-        raise InputError(f"{path}: {text}")
-    file = from_table(str(path), _File, hector_names() | table)
+    names = hector_names() | {key: table[key] for key in hector_names() if key in table}
+    try:
+        named = from_table(str(path), Names, names)
+    except InputError as error:
+        raise InputError(f"{error}; {convert_by(path)}") from None
+    others = {key: x for key, x in table.items() if key not in names}
+    file = from_table(str(path), _File, others)
     name = path.stem if file.name is None else file.name
     if not name.replace("-", "").replace("_", "").isalnum():
         text = "name must be letters, digits, - and _ (it names a folder)"
@@ -324,10 +311,10 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
         model=path.parent / model_name(path, table),
         path=path,
         name=name,
-        standing=file.standing,
-        joints=sum(file.joints.legs.values(), ()),
-        linkage=file.joints.linkage,
-        feet=tuple(file.feet.feet.values()),
+        standing=named.standing,
+        joints=named.all_joints,
+        linkage=named.joints.linkage,
+        feet=tuple(Foot(x.point, x.places) for x in (named.feet[leg] for leg in named.joints.legs)),
         **vars(file.limits),
         control=_as_tuples({name: x for name, x in sections.items() if x is not None}),
         nominal=file.weights.nominal and file.weights.nominal.rows(),
@@ -339,19 +326,9 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
     )
 
 
-def published_key(table: dict[str, Any]) -> str:
-    """Return the first key of a table that a robot in the standard form has not, "" if none."""
-    sections = (
-        ("joints", PUBLISHED),
-        *((f"feet.{leg}", ("body",)) for leg in sum(FEET.values(), ())),
-    )
-    keys = ["standing"] * isinstance(table.get("standing"), dict)
-    for name, own in sections:
-        section: Any = table
-        for part in name.split("."):
-            section = section.get(part, {}) if isinstance(section, dict) else {}
-        keys += [f"{name}.{key}" for key in own if isinstance(section, dict) and key in section]
-    return next(iter(keys), "")
+def convert_by(path: Path) -> str:
+    """Return the words that name the command which brings a file into the standard form."""
+    return f"a robot as published is converted once, by hector robot {path} --out FOLDER"
 
 
 @cache

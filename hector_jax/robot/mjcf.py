@@ -24,6 +24,7 @@ from hector_jax.core.inputs import (
     short_repr,
 )
 from hector_jax.core.settings import NOT_NEGATIVE, POSITIVE, Range
+from hector_jax.robot.description import convert_by
 
 TIME_STEP = 0.001  # [s] of plant, joint control and samples of every robot
 MOST_BYTES = 1_000_000
@@ -57,11 +58,6 @@ _RANGES_OF = {
 _PAIRS = ("range", "ctrlrange", "forcerange", "actuatorfrcrange")
 _MEMORY = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30}
 _MOST_MEMORY = 2**30
-
-
-def convert_by(path: Path) -> str:
-    """Return the words that name the command which brings a file into the standard form."""
-    return f"convert it once: hector robot {path} --out FOLDER"
 
 
 def read_mjcf(path: Path, toml: Path) -> ElementTree.Element:

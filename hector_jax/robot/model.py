@@ -22,8 +22,8 @@ from scipy.spatial.transform import Rotation
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, one_line
 from hector_jax.robot.checks import check_form, check_soles, check_standing
-from hector_jax.robot.description import HECTOR, Description, read_description
-from hector_jax.robot.mjcf import convert_by, mujoco_errors, read_mjcf, text_of
+from hector_jax.robot.description import HECTOR, Description, convert_by, read_description
+from hector_jax.robot.mjcf import mujoco_errors, read_mjcf, text_of
 from hector_jax.robot.poses import data_at, inertia_about, standing_data, trunk_body
 
 _CLOSED_AXES = np.eye(3)[[2, 0, 1, 1, 1]]  # yaw, roll, hip pitch, knee, ankle
