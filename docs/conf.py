@@ -57,7 +57,8 @@ PACKAGES = {  # in this order: title and purpose of each page of the reference
     "own": ("Your own controller", "Logs, programs and plans that are not of this project."),
     "walk_tuning": ("Tuning on walks", "The tuning whose value is walks; their logs and record."),
     "export": ("Export", "Weights and controller as files for a robot's computer."),
-    "report": ("Report", "Tables, pictures, films and pages of a run."),
+    "report": ("Report", "Tables and pictures of a run."),
+    "view": ("View", "Films, and pages in the browser."),
 }
 PUBLIC = {  # of packages without `__all__`, in whichever of their modules they are defined
     "core": "State Wrench Load Trajectory InputError setup_jax",
@@ -72,7 +73,8 @@ PUBLIC = {  # of packages without `__all__`, in whichever of their modules they 
     "own": "program_of Walker walker_engine compare_plans compare_calls",
     "walk_tuning": "Campaign WalkTuning tune_on_walks",
     "export": "export",
-    "report": "compare_runs write_film",
+    "report": "compare_runs",
+    "view": "write_film",
 }
 MENU = {  # of the site: pages by caption, in this order
     "Start": "start concepts tutorial notebooks/tune notebooks/phi",

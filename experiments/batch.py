@@ -23,7 +23,7 @@ from hector_jax.control.weights_file import save_weights
 from hector_jax.core.console import bar
 from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, Range
 from hector_jax.core.tree import stack
 from hector_jax.grfm.effect import last_command

@@ -22,7 +22,7 @@ from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import nominal
 from hector_jax.core.console import say
 from hector_jax.core.inputs import InputError, plural
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, Range, check
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.report.report import markdown_table

@@ -34,7 +34,7 @@ from hector_jax.core.console import bar, say
 from hector_jax.core.environment import code_hash
 from hector_jax.core.files import as_json, write_file
 from hector_jax.core.inputs import InputError
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 from hector_jax.core.tree_file import save_tree
 from hector_jax.own.planner import call_planner
 from hector_jax.own.program import program_of
@@ -247,7 +247,7 @@ def calibration(pairs: Sequence[Pair], known: Mapping[str, Any]) -> dict[str, An
             "several": several(found) or before.get("several", {}),
             "pairs": rows,
         }
-    return {"code": code_hash("verdict.foretell"), "pairs": groups}
+    return {"code": code_hash(("verdict.foretell",)), "pairs": groups}
 
 
 def several(pairs: Sequence[Pair]) -> dict[str, tuple[int, int]]:

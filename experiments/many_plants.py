@@ -34,7 +34,7 @@ from hector_jax.core.files import make_folder
 from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError, plural, require_package
 from hector_jax.core.journal import add_row, continue_journal
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, Range
 from hector_jax.core.trajectory import SOLVED
 from hector_jax.core.tree import stack
@@ -113,7 +113,7 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
         "numbers": list(campaign.config.others),
         "start": weights_tree(campaign.start),
         "plants": [tree_hash(plant) for plant in campaign.plants],
-        "code": [code_hash("walk_tuning.walks", *engine.modules), function_id(search)],
+        "code": [code_hash(("walk_tuning.walks", *engine.modules)), function_id(search)],
         **{name: getattr(flags, name) for name in ("population", "spread", "seed")},
     }
     others = campaign.config.others

@@ -9,17 +9,20 @@
     robots        four robots walking
     page          the browser page of a run (needs Chromium and a run: --run)
     live          the browser page of a live walk (needs Chromium)
+    live-film     ten seconds of it, in which a weight is turned and the robot pushed
 
 Walks are those of the first plant of the hardware stand-in, which no tuning has read; the robots of
 `robots` walk on the high-fidelity simulator.
 """
 
 import json
+import re
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -48,13 +51,13 @@ from hector_jax.control.weights_file import best
 from hector_jax.core.console import exit_code, say
 from hector_jax.core.settings import check
 from hector_jax.core.trajectory import Trajectory
-from hector_jax.report.motion import motions
 from hector_jax.report.plots.style import SETS, drawing, label_of, looks_of
-from hector_jax.report.video import VideoConfig, write_film, write_strip
 from hector_jax.robot.model import Robot
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections
 from hector_jax.verdict.foretell import HERE, calibrated
+from hector_jax.view.motion import motions
+from hector_jax.view.video import VideoConfig, write_film, write_strip
 
 ROOT = Path(__file__).parents[1]
 OUT = ROOT / "docs" / "pictures"
@@ -300,8 +303,46 @@ def draw_live(path: Path) -> None:
     _take_picture(path, ["--live", "--weights", "nominal", "best"], "Real-time factor", 25.0)
 
 
+def draw_live_film(path: Path) -> None:
+    """Film the page of `hector view --live` at a tenth of its speed, shown ten times as fast.
+
+    Q_pitch is turned down after three seconds and back after six; a push from behind follows.
+    """
+    acts = {
+        3.0: lambda tab: tab.fill("Q_pitch", "0"),
+        6.0: lambda tab: tab.click("Undo"),
+        8.0: lambda tab: tab.click("from behind"),
+    }
+    frames: list[Image.Image] = []
+    flags = ["--live", "--weights", "best"]
+    with _opened_page(flags, "Real-time factor", 20.0, height=720) as tab:
+
+        def now() -> float:
+            return float(re.search(r"best: (-?[\d.]+) s; ", tab.text())[1])  # pyright: ignore
+
+        tab.fill("speed [real time]", "0.1")
+        start = shown = now()
+        while shown < start + 10.0:
+            if (at := now()) < shown + 0.2:
+                continue
+            for due in [due for due in acts if due < at - start]:
+                acts.pop(due)(tab)
+            shown = at
+            frames.append(Image.fromarray(tab.picture()).resize((800, 480)))
+    frames[0].save(
+        path, save_all=True, append_images=frames[1:], duration=200, loop=0, quality=60, method=6
+    )
+
+
 def _take_picture(path: Path, flags: list[str], words: str, seconds: float) -> None:
     """Take a picture of the page of `hector view`, so long after it shows these words."""
+    with _opened_page(flags, words, seconds) as tab:
+        Image.fromarray(tab.picture()).save(path, optimize=True)
+
+
+@contextmanager
+def _opened_page(flags: list[str], words: str, seconds: float, height: int = 960) -> Iterator[Any]:
+    """Open the page of `hector view` in a browser, until so long after it shows these words."""
     sys.path.insert(0, str(ROOT / "tests"))
     from browser import opened  # pyright: ignore[reportMissingImports]
 
@@ -310,14 +351,17 @@ def _take_picture(path: Path, flags: list[str], words: str, seconds: float) -> N
     try:
         assert server.stderr is not None
         address = next(x for x in server.stderr if x.startswith("open http")).split()[1]
-        with tempfile.TemporaryDirectory() as profile, opened(address, profile, height=960) as tab:
+        with (
+            tempfile.TemporaryDirectory() as profile,
+            opened(address, profile, height=height) as tab,
+        ):
             deadline = time.monotonic() + 240.0
             while words not in tab.text() and time.monotonic() < deadline:
                 time.sleep(2.0)
             time.sleep(seconds)
             tab.call("Runtime.evaluate", expression=CLOSE_NOTICES)
             time.sleep(2.0)
-            Image.fromarray(tab.picture()).save(path, optimize=True)
+            yield tab
     finally:
         server.terminate()
         server.wait()
@@ -348,6 +392,7 @@ PICTURES: dict[str, tuple[Path, Callable[[Path], None] | None]] = {
     "robots": (OUT / "robots.png", draw_robots),
     "page": (OUT / "page.png", None),  # takes the run too
     "live": (OUT / "live.png", draw_live),
+    "live-film": (OUT / "live.webp", draw_live_film),
 }
 
 

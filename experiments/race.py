@@ -33,7 +33,7 @@ from hector_jax.core.arrays import Array
 from hector_jax.core.console import bar
 from hector_jax.core.files import make_folder
 from hector_jax.core.identity import function_id
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 from hector_jax.core.settings import AT_LEAST_ONE, SEED, Range, check
 from hector_jax.grfm.network import effect_of
 from hector_jax.report.report import markdown_table

@@ -18,7 +18,7 @@ import numpy as np
 from hector_jax.cli.arguments import data_folder
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import nominal
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import load_robot

@@ -29,7 +29,7 @@ from hector_jax.control.reference import COMMANDS, UNSEEN
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.inputs import InputError, plural
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 from hector_jax.core.settings import check
 from hector_jax.core.trajectory import SOLVED
 from hector_jax.core.tree_file import tree_hash

@@ -33,7 +33,7 @@ from hector_jax.control.weights import (
 )
 from hector_jax.core.console import bar
 from hector_jax.core.inputs import plural
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 from hector_jax.core.settings import check
 from hector_jax.core.trajectory import Load
 from hector_jax.grfm.effect import Effect, Window, last_command

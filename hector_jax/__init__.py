@@ -2,8 +2,8 @@
 
 The names below are the public surface; each package has its own. They are imported when they are
 first used, so that `import hector_jax` costs nothing. core, qp, robot, control, sim, grfm and
-tuning are the method; importing, own, store, verdict, walk_tuning, export, report and cli are the
-application on it, which the method does not import. Words of this code:
+tuning are the method; importing, own, store, verdict, walk_tuning, export, report, view and cli are
+the application on it, which the method does not import. Words of this code:
 
 - weights, theta: the diagonals of Q and R, with any further numbers that are tuned (`others`).
 - phi, effect: phi maps the commanded ground wrench to its effect on the body; GRFM-Net is a phi.

@@ -14,7 +14,7 @@ from pretend import call
 from hector_jax.core import cluster
 from hector_jax.core.console import Broken
 from hector_jax.core.inputs import InputError
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 
 distributed = pytest.importorskip("distributed")
 

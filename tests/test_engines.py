@@ -18,12 +18,12 @@ from hector_jax.control import expert, named_command, nominal, standing_anchor, 
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
-from hector_jax.report import pictures
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.engine import ENGINES, MJX, MUJOCO_C, Engine, choose_engine
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.world import Push, build_world, hfs, ideal
 from hector_jax.verdict.metrics import score
+from hector_jax.view import pictures
 
 HECTOR = load_robot()
 CONFIG = walk_config(HECTOR)

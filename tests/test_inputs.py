@@ -26,9 +26,9 @@ from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.tree_file import save_tree
 from hector_jax.grfm import network
 from hector_jax.grfm.training import TrainConfig
-from hector_jax.report.video import VideoConfig
 from hector_jax.store import collection
 from hector_jax.store.nets import CollectConfig
+from hector_jax.view.video import VideoConfig
 
 QUIET = {"database": None, "deadline": None, "suppress_health_check": list(HealthCheck)}
 hundreds = settings(max_examples=300, derandomize=True, **QUIET)

@@ -174,8 +174,8 @@ def test_a_key_has_the_versions_of_all_packages_that_compute(see):
     modules = ["grfm.training", "walk_tuning.walks", "sim.walk"]
     modules += [module for engine in ENGINES.values() for module in engine.modules]
     keys = {
-        partial(code_hash, "tuning.difftune"): "jax jaxlib jaxopt numpy optax scipy",
-        partial(code_hash, *modules): "flax mujoco mujoco-mjx drake pin",
+        partial(code_hash, ("tuning.difftune",)): "jax jaxlib jaxopt numpy optax scipy",
+        partial(code_hash, tuple(modules)): "flax mujoco mujoco-mjx drake pin",
         partial(function_id, optax.linear_schedule): "optax",
         partial(function_id, lambda x: optax.linear_schedule(x, 0.0, 1)): "optax",
         partial(function_id, np.linalg.norm): "numpy",
@@ -231,7 +231,7 @@ def test_a_result_holds_for_the_code_that_computes_it(see, tmp_path, module, old
     text = source(module).read_text()
     assert old in text
     edited.write_text(text.replace(old, new))
-    hashes = lambda: [code_hash("sim.walk"), code_hash("tuning.difftune", "grfm.network")]  # noqa: E731
+    hashes = lambda: [code_hash(x) for x in (("sim.walk",), ("tuning.difftune", "grfm.network"))]  # noqa: E731
     before = hashes()
     see("_source", lambda name: edited if name == module else source(name))
     assert [x == y for x, y in zip(before, hashes(), strict=True)] == [same, same]

@@ -19,13 +19,13 @@ from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal, weights_to_vector
 from hector_jax.control.weights_file import best, load_weights, weights_tree
-from hector_jax.report.live import Frame, Session, count_compilations
-from hector_jax.report.live_tuning import Tuner, take_step, what_matters
-from hector_jax.report.live_weights import PageSetup
-from hector_jax.report.view import opened_server
-from hector_jax.report.view_live import LivePage
 from hector_jax.robot.model import compile_model
 from hector_jax.sim.world import hfs, hfs_even
+from hector_jax.view.live import Frame, Session, count_compilations
+from hector_jax.view.live_page import LivePage
+from hector_jax.view.live_tuning import Tuner, take_step, what_matters
+from hector_jax.view.live_weights import PageSetup
+from hector_jax.view.page import opened_server
 
 PLANT = hfs(ROBOT.description)
 

@@ -18,6 +18,7 @@ from hector_jax.cli import doctor
 from hector_jax.core import numerics, runtime
 from hector_jax.core.inputs import InputError
 from hector_jax.core.numerics import add_flags, without_our_flags
+from hector_jax.core.pool import workers
 
 # a net's parameters and draws of the kinds that we use; a reference, whose ranks and dtypes are
 # promoted and which takes NumPy's arrays; and one that is NaN
@@ -99,7 +100,7 @@ def test_the_doctor_lists_what_the_environment_sets(monkeypatch):
 def test_a_worker_computes_in_64_bits_and_draws_what_its_parent_draws(monkeypatch):
     monkeypatch.setenv("JAX_RANDOM_SEED_OFFSET", "1")
     monkeypatch.setenv("JAX_DEFAULT_PRNG_IMPL", "rbg")
-    with runtime.workers(1) as pool:
+    with workers(1) as pool:
         assert pool.submit(jnp.zeros, 3).result(timeout=60).dtype == jnp.float64
         drawn = pool.submit(jax.random.PRNGKey, 3).result(timeout=60)
     np.testing.assert_array_equal(drawn, jax.random.PRNGKey(3))
@@ -116,19 +117,19 @@ def test_where_no_core_can_be_claimed_a_worker_keeps_all(monkeypatch):
 def test_workers_share_out_the_cores_and_a_single_one_has_one_too():
     """Else the number of processes would change the rounding of results."""
     assert [runtime._claim_core([-1, -2]) for _ in range(4)] == [-1, -2, -1, -2]
-    with runtime.workers(1) as pool:
+    with workers(1) as pool:
         assert len(pool.submit(os.sched_getaffinity, 0).result(timeout=60)) == 1
 
 
 def test_without_semaphores_one_process_computes_and_several_are_refused(monkeypatch):
     refused = mock.Mock(side_effect=OSError(30, "Read-only file system"))
     monkeypatch.setattr("_multiprocessing.SemLock", refused)
-    with runtime.workers(1) as pool:
+    with workers(1) as pool:
         assert list(pool.map(pow, (2, 3), (2, 2))) == [4, 9]
         assert pool.submit(os.getpid).result() == os.getpid()
         assert isinstance(pool.submit(int, "x").exception(), ValueError)
     with pytest.raises(InputError, match="no worker processes: .* --processes 1 needs none"):
-        with runtime.workers(2):
+        with workers(2):
             pass
 
 

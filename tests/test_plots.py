@@ -14,11 +14,12 @@ from pretend import elsewhere, instead, pretend_history, pretend_walk
 from scipy.spatial.transform import Rotation
 
 from hector_jax import PAPER_LOSS, InputError, State
-from hector_jax.report import plots, video
-from hector_jax.report.motion import motion, motions, poses
+from hector_jax.report import plots
 from hector_jax.report.plots.style import SETS, looks_of
-from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film, write_strip
 from hector_jax.robot.description import MODEL_PATH
+from hector_jax.view import video
+from hector_jax.view.motion import motion, motions, poses
+from hector_jax.view.video import VideoConfig, VideoUnavailable, write_film, write_strip
 
 FOUR = ("nominal", "expert", "without", "with")
 

@@ -27,7 +27,8 @@ from hector_jax.core import files as core_files
 from hector_jax.core.console import exit_code
 from hector_jax.core.files import WriteError, locked, write_json
 from hector_jax.core.inputs import InputError
-from hector_jax.core.runtime import cache_folder, workers
+from hector_jax.core.pool import workers
+from hector_jax.core.runtime import cache_folder
 from hector_jax.core.tree_file import save_tree
 from hector_jax.store.cache import load_or_make
 
@@ -231,7 +232,7 @@ PROGRAM = """
 import sys, time
 from multiprocessing import active_children
 from hector_jax.core.console import exit_code
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 
 def work():
     with workers(1) as pool:

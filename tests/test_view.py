@@ -22,11 +22,13 @@ from hector_jax.core.files import write_json
 from hector_jax.core.journal import write_rows
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.network import save_net
-from hector_jax.report import fidelity, pictures, view
-from hector_jax.report.motion import motion
-from hector_jax.report.view import ViewedWalk, arrows
+from hector_jax.report import fidelity
 from hector_jax.store import run as runs
 from hector_jax.store.cache import robot_hash
+from hector_jax.view import page as view
+from hector_jax.view import pictures
+from hector_jax.view.motion import motion
+from hector_jax.view.page import ViewedWalk, arrows
 
 
 def viewed(seed=0, **kwargs):

@@ -221,7 +221,8 @@ open(sys.argv[2], "w").write(json.dumps(seen))
 SHOW = """
 import os, sys
 from pathlib import Path
-from hector_jax.core.runtime import setup_jax, workers
+from hector_jax.core.pool import workers
+from hector_jax.core.runtime import setup_jax
 from hector_jax.own.program import call_program, program_of
 if __name__ == "__main__":
     os.sched_setaffinity(0, {int(sys.argv[2])})

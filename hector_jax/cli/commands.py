@@ -28,7 +28,7 @@ from hector_jax.control.weights_file import weights_tree
 from hector_jax.core.console import say
 from hector_jax.core.files import locked, write_file
 from hector_jax.core.inputs import InputError
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 from hector_jax.core.settings import as_toml
 from hector_jax.export import export
 from hector_jax.export.template import fill_template

@@ -20,8 +20,6 @@ from hector_jax.core.inputs import InputError, one_line
 from hector_jax.core.numerics import not_used, without_our_flags
 from hector_jax.core.runtime import cache_folder
 from hector_jax.core.trajectory import SOLVED, Trajectory
-from hector_jax.report.motion import motions
-from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film
 from hector_jax.robot.description import MODEL_PATH
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.sim.engine import ENGINES, choose_engine
@@ -29,6 +27,8 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import named_world
 from hector_jax.verdict.judging import walk_rigid_body
+from hector_jax.view.motion import motions
+from hector_jax.view.video import VideoConfig, VideoUnavailable, write_film
 
 _EXTRAS = {  # name: (packages that it needs, what needs it)
     "cluster": (("distributed",), "--cluster"),

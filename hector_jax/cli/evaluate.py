@@ -26,7 +26,7 @@ from hector_jax.core.console import say
 from hector_jax.core.environment import environment
 from hector_jax.core.files import locked
 from hector_jax.core.inputs import InputError, plural
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 from hector_jax.core.settings import SEED
 from hector_jax.report import matrix as report
 from hector_jax.report.compare import compare_runs, print_comparison

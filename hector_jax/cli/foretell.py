@@ -115,9 +115,9 @@ def _lines(result: Mapping[str, Any], logs: int) -> Iterator[str]:
         text = f"{wider:.1f} times as wide as measured: the rigid body explains less of this walk"
         yield f"they are {text} than of any that was measured"
     if logs > 1:
-        counted = held_by_means(result["calibration"], logs)
-        held = "held in {} of {} cases".format(*counted) if counted else "that was not measured"
-        yield f"means of {logs} logs, with intervals of one: {held}"
+        held, cases = held_by_means(result["calibration"], logs) or (0, 0)
+        told = f"held in {held} of {cases} cases" if cases else "that was not measured"
+        yield f"means of {logs} logs, with intervals of one: {told}"
     for name, row in result["sets"].items():
         if row["falls"]:
             yield f"{name} falls in its foretold walk: the numbers of its row are no forecast"

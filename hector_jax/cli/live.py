@@ -14,15 +14,15 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.weights import Weights
 from hector_jax.core.console import Broken, say
 from hector_jax.core.inputs import InputError, require_package
-from hector_jax.core.runtime import start_process, workers
-from hector_jax.report.live import simulate
-from hector_jax.report.live_tuning import Tuner
-from hector_jax.report.live_weights import PageSetup
-from hector_jax.report.view import opened_server
-from hector_jax.report.view_live import serve_live
+from hector_jax.core.pool import start_process, workers
 from hector_jax.robot.model import Robot, compile_model, load_robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import WORLDS, named_world
+from hector_jax.view.live import simulate
+from hector_jax.view.live_page import serve_live
+from hector_jax.view.live_tuning import Tuner
+from hector_jax.view.live_weights import PageSetup
+from hector_jax.view.page import opened_server
 
 
 def run_live(args: View) -> None:

@@ -17,7 +17,7 @@ from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import say
 from hector_jax.core.files import locked, make_folder, write_json
 from hector_jax.core.inputs import InputError, plural, unknown
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 from hector_jax.own import walk_log
 from hector_jax.robot.model import load_robot
 from hector_jax.store import tunings
@@ -71,8 +71,8 @@ def run_add(args: Add) -> None:
         return
     texts = list(map(str, args.logs))
     given = _files(texts, list(campaign.commands))
-    length = campaign.seconds, campaign.config.rollout.walk.gait.tick
-    bags = arguments.logs_of(args, [*given.values()], campaign.robot, *length)
+    tick = campaign.config.rollout.walk.gait.tick
+    bags = arguments.logs_of(args, [*given.values()], campaign.robot, campaign.seconds, tick)
     with locked(args.folder), workers(PROCESSES) as pool, bags as paths:
         files = dict(zip(given, paths, strict=True))
         before = added_logs.read_campaign(pool, campaign)
@@ -192,8 +192,8 @@ def _told_text(told: Mapping[str, Any], best: int) -> str:
     """Return the line of a forecast against the best set before it, walked or not."""
     if "not foretold" in told:
         return f"not foretold: {told['not foretold']}"
-    ends = (np.nan if told[x] is None else told[x] for x in ("low", "high"))
-    text = f"L {Interval(told['change'], *ends).text()} % against walk {best} is foretold"
+    low, high = (np.nan if told[x] is None else told[x] for x in ("low", "high"))
+    text = f"L {Interval(told['change'], low, high).text()} % against walk {best} is foretold"
     if "walked" not in told:
         return text
     held = {True: "as foretold", False: "not as foretold", None: "foretold without an interval"}

@@ -68,8 +68,7 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
     start = arguments.weights_by_name(args.start, robot)
     kept = len(kept_trajectories(args, robot, loaded))
     along = len(along_of(start, arguments.own_numbers(args, robot), args.slopes == "walks"))
-    given = args.walk_plants, args.walks, len(loaded)
-    best_set.walk_plants(robot, *given, along=along, kept=kept)
+    best_set.walk_plants(robot, args.walk_plants, args.walks, len(loaded), along=along, kept=kept)
     if args.net:
         load_trained(args.net, robot, args.variant)
     arguments.engine_of(args)  # whether it is installed
@@ -135,7 +134,7 @@ def begin(folder: Path, args: Tune) -> Path:
             "began": f"{datetime.now():{TIME}}",
             "directory": str(Path.cwd()),
             "robot": robot_hash(load_robot(args.robot)),
-            "code": code_hash(*_CODE),
+            "code": code_hash(_CODE),
         }
         write_json(new / CONFIG, config)
         while True:
@@ -165,7 +164,7 @@ def resume(folder: Path, args: Tune) -> Tune:
         convert(config.get(name), str, name=f"{path}: {name}")
     remedy = f"{_REMEDY} ({made_with.get('commit', 'no commit is noted')})"
     # the flags of other code may be others
-    check_settings(folder, {"code": config["code"]}, {"code": code_hash(*_CODE)}, remedy)
+    check_settings(folder, {"code": config["code"]}, {"code": code_hash(_CODE)}, remedy)
     begun = from_file(Tune, path)
     robot = robot_hash(load_robot(begun.robot))
     check_settings(folder, {"robot": config["robot"]}, {"robot": robot}, remedy)

@@ -25,14 +25,13 @@ from hector_jax.core.console import say
 from hector_jax.core.environment import environment
 from hector_jax.core.files import locked, write_json
 from hector_jax.core.inputs import InputError, plural
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.network import as_effect
-from hector_jax.report import fidelity, pictures
+from hector_jax.report import fidelity
 from hector_jax.report.report import Picture, elsewhere_line, first_lines, print_tables
 from hector_jax.report.run import write_run_report
-from hector_jax.report.video import check_film
 from hector_jax.robot.model import describe, load_robot
 from hector_jax.sim.diagnosis import fall_of
 from hector_jax.sim.loop import Job
@@ -47,6 +46,8 @@ from hector_jax.tuning.evaluate import aligned
 from hector_jax.verdict import judging, metrics
 from hector_jax.verdict.foretell import Carried, carry
 from hector_jax.verdict.judging import Judged
+from hector_jax.view import pictures
+from hector_jax.view.video import check_film
 from hector_jax.walk_tuning import best_set
 from hector_jax.walk_tuning.campaign import Campaign
 from hector_jax.walk_tuning.starts import with_best_start

@@ -13,15 +13,16 @@ from hector_jax.core.inputs import InputError, require_package
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.network import as_effect, load_net
-from hector_jax.report import fidelity, pictures, view
-from hector_jax.report.motion import Motion, motion
+from hector_jax.report import fidelity
 from hector_jax.report.plots.style import titled
 from hector_jax.report.report import WORLDS
-from hector_jax.report.video import check_film
 from hector_jax.robot.model import compile_model
 from hector_jax.store import nets
 from hector_jax.store.run import Run
 from hector_jax.verdict import metrics
+from hector_jax.view import page, pictures
+from hector_jax.view.motion import Motion, motion
+from hector_jax.view.video import check_film
 
 
 def _run_of(args: View) -> Path:
@@ -64,7 +65,7 @@ def run_view(args: View) -> None:
         what = f"no net at {net}" if params is None else f"{net} is not the net of this run"
         say(f"{what}, so its predictions are not shown")
 
-    def walk() -> tuple[dict[str, view.ViewedWalk], str]:
+    def walk() -> tuple[dict[str, page.ViewedWalk], str]:
         """Walk with both sets; return the walks and their description in Markdown."""
         world, walks = WORLDS.get(args.world, args.world), {}
         lines = [f"**{request.trajectory}** in {world}, seed {args.seed}"]
@@ -76,7 +77,7 @@ def run_view(args: View) -> None:
             lines.append(f"{when}: {words}, {plane:.1f} cm off (RMS), L {loss:.3f}e6")
             say(f"  {lines[-1]}")
             trajectory = at_interval(trajectory, walk_config(robot).gait.tick)
-            walks[name] = view.ViewedWalk(trajectory, fidelity.curves(robot, trajectory, effects))
+            walks[name] = page.ViewedWalk(trajectory, fidelity.curves(robot, trajectory, effects))
         return walks, "\n\n".join(lines)
 
     def motions() -> tuple[dict[str, Motion], str]:
@@ -92,4 +93,4 @@ def run_view(args: View) -> None:
         return
     on_open = lambda address: say(f"open {address} in a browser; Ctrl-C ends it")  # noqa: E731
     address = {"host": args.host, "port": args.port}
-    view.serve(motions, compile_model(robot.description), path, on_open, **address)
+    page.serve(motions, compile_model(robot.description), path, on_open, **address)

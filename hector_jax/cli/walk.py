@@ -18,7 +18,7 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.core.console import Broken, bar, say, say_if_slow
 from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError, plural, printable
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 from hector_jax.core.trajectory import SOLVED
 from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import save_tree
@@ -27,8 +27,7 @@ from hector_jax.grfm.dataset import at_interval, make_dataset
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect
 from hector_jax.own.walk_log import walk_card
-from hector_jax.report import fidelity, pictures
-from hector_jax.report.video import check_film
+from hector_jax.report import fidelity
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.diagnosis import Fall, fall_of
 from hector_jax.sim.engine import MUJOCO_C
@@ -40,6 +39,8 @@ from hector_jax.store.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import Loss, loss_of_robot
 from hector_jax.verdict import judging, metrics
+from hector_jax.view import pictures
+from hector_jax.view.video import check_film
 
 
 def _check_world(args: Walk) -> None:

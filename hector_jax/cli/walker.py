@@ -23,7 +23,7 @@ from hector_jax.control.weights_file import save_weights
 from hector_jax.core.console import say
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, plural
-from hector_jax.core.runtime import workers
+from hector_jax.core.pool import workers
 from hector_jax.core.trajectory import FEET, State, Trajectory
 from hector_jax.own.conventions import find_conventions, lines_of, settings_of
 from hector_jax.own.log_check import check_log, read_check, unasked
@@ -291,16 +291,19 @@ def _campaign(
 ) -> Campaign:
     """Return the settings of a tuning on the walks of a program."""
     kept = run_folder.kept_trajectories(args, robot, trajectories)
-    given, groups = (args.walk_plants, args.walks, len(trajectories)), args.slopes == "walks"
+    groups, commands = args.slopes == "walks", len(trajectories)
     start = arguments.weights_by_name(args.start, robot)
     along = len(along_of(start, config.others, groups))
+    plants, _ = best_set.walk_plants(
+        robot, args.walk_plants, args.walks, commands, along=along, kept=len(kept)
+    )
     return Campaign(
         folder / "walks",
         best_set.on_walks(config),
         robot,
         start,
         {trajectory.name: trajectory.command for trajectory in trajectories},
-        best_set.walk_plants(robot, *given, along=along, kept=len(kept))[0],
+        plants,
         arguments.engine_of(args),
         arguments.planner_of(args),
         groups,

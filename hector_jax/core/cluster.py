@@ -21,7 +21,9 @@ from hector_jax.core.runtime import start_worker
 
 _PATIENCE = 5.0  # [s] for a scheduler to answer
 # modules of the jobs
-_CODE = "store.tunings verdict.judging walk_tuning.walks own.walker sim.drake sim.pinocchio".split()
+_CODE = tuple(
+    "store.tunings verdict.judging walk_tuning.walks own.walker sim.drake sim.pinocchio".split()
+)
 
 _Versions = tuple[tuple[str, str], ...]
 
@@ -29,7 +31,7 @@ _Versions = tuple[tuple[str, str], ...]
 @cache
 def _versions() -> _Versions:
     """Return what must be the same on all machines, by name."""
-    code = {"code of hector_jax (or XLA_FLAGS)": code_hash(*_CODE)}
+    code = {"code of hector_jax (or XLA_FLAGS)": code_hash(_CODE)}
     machine = {"platform": f"{platform.system()} {platform.machine()}"}
     return tuple((versions() | machine | code).items())
 

@@ -20,7 +20,8 @@ from hector_jax.core.numerics import without_our_flags
 # modules that do not affect numerical results
 _NO_NUMBERS = (
     "control.weights_file core.cluster core.console core.environment core.files core.identity"
-    " core.inputs core.journal core.runtime core.tree_file store.cache store.run store.setup"
+    " core.inputs core.journal core.pool core.runtime core.tree_file store.cache"
+    " store.run store.setup"
 ).split()
 _NUMERICS = "core.numerics"  # JAX's options, on which all numbers depend
 # imported names whose package has another name or brings another package that computes
@@ -83,7 +84,7 @@ def _commit(folder: Path) -> str:
 
 
 @cache
-def code_hash(*modules: str) -> str:
+def code_hash(modules: tuple[str, ...]) -> str:
     """Return a hash (12 hexadecimal digits) of the code and packages that determine a result.
 
     It covers the syntax trees, without docstrings, of the modules, of every module of this package

@@ -1,5 +1,5 @@
-"""Tables, figures, films and pages of a run.
+"""Tables, figures and pages of Markdown of a run.
 
 `run` writes the report of a tuning, `matrix` that of an evaluation, `compare` sets runs side by
-side; `plots` draws, `video` and `render` film, `view` serves the page in the browser.
+side; `plots` draws.
 """

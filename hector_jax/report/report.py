@@ -149,9 +149,9 @@ def _less(low: float, high: float) -> str:
     """Write the interval of a change of the loss [%] in words."""
     if low < 0.0 < high:
         return f"up to {-low:.0f} % less or {high:.0f} % more loss than with nominal"
-    ends = sorted((abs(low), abs(high)))
+    least, most = sorted((abs(low), abs(high)))
     word = "less" if high <= 0.0 else "more"
-    return "{:.0f} to {:.0f} % {} loss than with nominal".format(*ends, word)
+    return f"{least:.0f} to {most:.0f} % {word} loss than with nominal"
 
 
 def baselines(verdict: Verdict) -> list[str]:

@@ -354,7 +354,7 @@ def walk_many(
     batch: int = 0,
     build: BuildPlant = MujocoPlant,
 ) -> Iterator[Trajectory]:
-    """Walk all jobs in a pool (`runtime.workers`) or this process; yields the walks in order.
+    """Walk all jobs in a pool (`core.pool.workers`) or this process; yields the walks in order.
 
     `exact` and `batch` are those of an `Engine`: this one is always exact and compiles no batch.
     """

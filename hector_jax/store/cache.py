@@ -51,7 +51,7 @@ def content_key(*parts: Any, code: Sequence[str]) -> str:
 
     others = [getattr(getattr(part, "weights", part), "others", ()) for part in parts]
     boxes = sorted({tunable(x) for names in others for x in names if is_ours(name_of(x))})
-    key = "\n".join([*map(text, parts), repr(boxes), code_hash(*code)])
+    key = "\n".join([*map(text, parts), repr(boxes), code_hash(tuple(code))])
     return hashlib.sha256(key.encode()).hexdigest()[:12]
 
 

@@ -81,7 +81,7 @@ def collection_settings(config: CollectConfig, robot: Robot) -> dict[str, Any]:
         "physics_bits": engine.bits(False),
         "controller": repr(paths.rollout.walk),
         "paths": content_key(paths, robot, nominal(robot), code=()),
-        "code": code_hash(*COLLECTION_CODE, *engine.modules),
+        "code": code_hash((*COLLECTION_CODE, *engine.modules)),
     }
 
 
@@ -232,7 +232,7 @@ def training_settings(config: TrainConfig, robot: Robot) -> dict[str, Any]:
         **asdict(config),
         "functions": [function_id(f) for f in (phi.init, phi.fit, phi.apply)],
         "touchdown_error": robot.description.tuning.touchdown_error,
-        "code": code_hash(*TRAINING_CODE),
+        "code": code_hash(TRAINING_CODE),
     }
 
 

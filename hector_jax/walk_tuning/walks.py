@@ -363,7 +363,7 @@ def record_head(campaign: Campaign) -> dict[str, Any]:
         "kept": {name: tree_hash(command) for name, command in campaign.kept.items()},
         "settings": content_key(settings, campaign.start, code=()),
         "engine": campaign.engine.key,
-        "code": code_hash("walk_tuning.walks", *campaign.engine.modules),
+        "code": code_hash(("walk_tuning.walks", *campaign.engine.modules)),
     }
 
 

@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 from hector_jax.core.trajectory import FEET, Trajectory, Wrench, from_start
 from hector_jax.grfm.nets import History
 from hector_jax.report.fidelity import Drift
-from hector_jax.report.motion import Motion
 from hector_jax.report.plots import style
 from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, label_of, looks_of
 from hector_jax.report.report import caption
@@ -63,41 +62,6 @@ def draw_tracking(panels: np.ndarray, walks: Mapping[str, Trajectory]) -> None:
         panel.axhline(0.0, color="black", linewidth=0.8)
         style.widen(panel, 1.0)
     setp(panels[-1], xlabel="time [s]")
-
-
-def save_distances(
-    path: Path, motions: Mapping[str, Motion], width: int, height: int
-) -> tuple[int, int, int, int]:
-    """Draw the distance from the reference in the plane by time, for the lower part of a film.
-
-    Args:
-        path: file to write.
-        motions: two motions by title, before and after.
-        width: width of the picture [pixel].
-        height: height of the picture [pixel].
-
-    Returns:
-        Left, top, right and bottom of the axes in the picture [pixel].
-    """
-    dpi = height / 1.2  # the figure is always 1.2 inches high
-    last = max(motion.times[-1] for motion in motions.values())
-    with drawing(path, width / dpi, height / dpi, dpi=dpi, legend_columns=0) as figure:
-        axes = figure.subplots()
-        colours = style.rgb_of(motions)
-        for (name, motion), colour in zip(motions.items(), colours, strict=True):
-            upright = motion.times <= motion.fall_time
-            distance = np.where(upright, 100 * motion.distance, np.nan)
-            rms = "fell at once"
-            if upright.any():
-                rms = f"{np.sqrt(np.mean(distance[upright] ** 2)):.1f} cm RMS"
-            line = {"color": np.divide(colour, 255), "linewidth": 2.2}
-            axes.plot(motion.times, distance, **line, label=f"{label_of(name)}: {rms}")
-        axes.set_title("distance from the reference [cm]", loc="left")
-        axes.set(xlabel="time [s]", xlim=(0.0, last), ylim=(0.0, None))
-        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.95), ncols=2, borderaxespad=0.1)
-        figure.draw_without_rendering()
-        box = axes.get_window_extent()
-    return round(box.x0), round(height - box.y1), round(box.x1), round(height - box.y0)
 
 
 def save_path(path: Path, walks: Mapping[str, Trajectory]) -> str:

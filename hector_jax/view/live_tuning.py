@@ -20,7 +20,6 @@ from hector_jax.control.weights_file import weights_tree
 from hector_jax.core.inputs import InputError
 from hector_jax.grfm import network
 from hector_jax.grfm.dataset import at_interval
-from hector_jax.report.live import Walked
 from hector_jax.robot.model import Robot
 from hector_jax.sim.live import WINDOW
 from hector_jax.tuning import difftune
@@ -30,6 +29,7 @@ from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.grounded import Grounding, fit_grounding, grounded_rollout
 from hector_jax.tuning.loss import PAPER_LOSS, loss_of_robot
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout_config
+from hector_jax.view.live import Walked
 
 _SHOWN = 3  # directions
 _ERRORS = ("x", "y", "z", "roll", "pitch", "yaw")

@@ -27,9 +27,9 @@ from hector_jax.core.files import write_file
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, one_line
 from hector_jax.core.settings import AT_LEAST_ONE, Range, check, choose
-from hector_jax.report.motion import Motion
 from hector_jax.report.plots.style import label_of, rgb_of
 from hector_jax.robot.model import Robot, compile_model
+from hector_jax.view.motion import Motion
 
 BACK_ENDS = ("egl", "osmesa", "glfw")
 ENDINGS = (".mp4", ".webp", ".gif", ".png")  # all but the first are animated pictures

@@ -1,7 +1,7 @@
 """The page of a live walk: robots, what they are at, and all that a person can turn.
 
 All clients see one page. What they click or move is done in turn by the loop of `serve_live`; the
-robots walk in another process (`report.live`). Weights are moved as a tuning moves them, by their
+robots walk in another process (`view.live`). Weights are moved as a tuning moves them, by their
 logarithms and with one weight for all feet.
 """
 
@@ -17,14 +17,14 @@ from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.trajectory import FEET, SOLVED
-from hector_jax.report.live import Frame, Walked
-from hector_jax.report.live_tuning import Tuner
-from hector_jax.report.live_weights import PageSetup, WeightsPanel
-from hector_jax.report.motion import INK
 from hector_jax.report.plots.style import rgb_of
-from hector_jax.report.view_parts import add_floor, body_meshes, plot
 from hector_jax.sim.live import PUSH_TIME, WINDOW, Now
 from hector_jax.sim.world import MAX_DELAY, WORLDS, Imperfections, named_world
+from hector_jax.view.live import Frame, Walked
+from hector_jax.view.live_tuning import Tuner
+from hector_jax.view.live_weights import PageSetup, WeightsPanel
+from hector_jax.view.motion import INK
+from hector_jax.view.page_parts import add_floor, body_meshes, plot
 
 _STRIP = 10.0  # [s] of the errors that are drawn
 _SLOW = 0.95  # share of the wanted speed below which the machine is too slow
@@ -135,7 +135,10 @@ class LivePage:
 
     def _add_errors(self) -> None:
         gui = self._server.gui
-        gui.add_markdown("Forces of the ground: black as planned, orange as measured.")
+        gui.add_markdown(
+            "Forces of the ground: black as planned, orange as measured; they end inside the "
+            "friction cone of the floor, or the foot slips."
+        )
         with gui.add_folder(f"Errors, RMS of the last {WINDOW:g} s"):
             self._table = gui.add_markdown("")
             empty = {name: np.full(1, np.nan) for name in self._names}
@@ -225,6 +228,7 @@ class LivePage:
                 {
                     "bodies": bodies,
                     "arrows": [self._add_arrows(f"{root}/{kind}", kind) for kind in _FORCES],
+                    "cones": self._add_cones(f"{root}/cone"),
                     "aim": scene.add_icosphere(f"{root}/aim", 0.018, INK),
                 }
             )
@@ -238,6 +242,13 @@ class LivePage:
         feet = range(len(robot.foot_point))
         add = self._server.scene.add_arrows
         return [add(f"{root}{foot}", points, _FORCES[kind], **size) for foot in feet]
+
+    def _add_cones(self, root: str) -> list[Any]:
+        """Add the edges of the friction cone of each foot, as high as the force on it."""
+        edges, colours = np.zeros((8, 2, 3), np.float32), _FORCES["measured"]
+        add = self._server.scene.add_line_segments
+        feet = range(len(self._setup.robot.foot_point))
+        return [add(f"{root}{foot}", edges, colours, thickness=0.004) for foot in feet]
 
     def show(self, frame: Frame) -> None:
         """Show a frame; numbers and strips four times a second."""
@@ -270,6 +281,11 @@ class LivePage:
                 if arrow.visible:
                     end = _ARROW * height / weight * force
                     arrow.points = np.stack([np.zeros(3), end])[None].astype(np.float32)
+        for cone, foot, force in zip(handles["cones"], now.feet, now.measured, strict=True):
+            cone.position, cone.visible = foot, bool(force[2] > _LOADED * weight)
+            if cone.visible:
+                up = _ARROW * height / weight * force[2]
+                cone.points = up * _cone_edges(float(self._plant.floor_friction))
         handles["aim"].position = now.reference
 
     def _show_numbers(self, frame: Frame) -> None:
@@ -304,6 +320,13 @@ class LivePage:
         solved = now.residual <= SOLVED
         qp = "QP solved" if solved else f"**QP not solved**, residual {now.residual:.0e}"
         return f"{now.time:.1f} s; {qp}; " + ("; ".join(text) or "in the air")
+
+
+def _cone_edges(mu: float) -> Float[np.ndarray, "8 2 3"]:
+    """Return the edges of the cone |F_x| + |F_y| <= mu F_z up to F_z = 1: four up, four around."""
+    rim = np.array([[mu, 0.0, 1.0], [0.0, mu, 1.0], [-mu, 0.0, 1.0], [0.0, -mu, 1.0]], np.float32)
+    sides = np.stack([np.zeros_like(rim), rim], axis=1)
+    return np.concatenate([sides, np.stack([rim, np.roll(rim, -1, axis=0)], axis=1)])
 
 
 def _row(name: str, errors: Float[np.ndarray, "6"]) -> str:

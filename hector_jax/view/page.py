@@ -25,11 +25,11 @@ from jaxtyping import Float
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory, Wrench
-from hector_jax.report.motion import INK, Motion
 from hector_jax.report.plots.style import rgb_of
 from hector_jax.report.report import render
-from hector_jax.report.view_parts import add_floor, body_meshes, plot, series
 from hector_jax.store.run import METRICS, Run, loss_curves, progress_sentence
+from hector_jax.view.motion import INK, Motion
+from hector_jax.view.page_parts import add_floor, body_meshes, plot, series
 
 _RATE = 30.0  # displayed ticks per second, at most
 _PAUSE = 1.0  # [s] between readings of the metrics

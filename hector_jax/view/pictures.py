@@ -1,4 +1,4 @@
-"""The pictures and the film of each command, drawn by plots and video.py."""
+"""The pictures and the film of each command, drawn by `report.plots` and `video`."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,14 +11,14 @@ from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.grfm.nets import History
 from hector_jax.report import plots
 from hector_jax.report.fidelity import Drift
-from hector_jax.report.motion import motions
 from hector_jax.report.report import WORLDS, Picture
-from hector_jax.report.video import VideoUnavailable, write_film
-from hector_jax.report.view import ViewedWalk
 from hector_jax.robot.model import Robot
 from hector_jax.store.run import Histories
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.loss import Loss
+from hector_jax.view.motion import motions
+from hector_jax.view.page import ViewedWalk
+from hector_jax.view.video import VideoUnavailable, write_film
 
 
 def of_run(

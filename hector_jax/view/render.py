@@ -4,7 +4,7 @@ It runs in a folder with `scenes.pickle`.
 """
 
 import pickle
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -17,9 +17,9 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
 from hector_jax.core.headless import mujoco
-from hector_jax.report.motion import INK, Motion
-from hector_jax.report.plots import save_distances
-from hector_jax.report.video import Scene
+from hector_jax.report.plots import style
+from hector_jax.view.motion import INK, Motion
+from hector_jax.view.video import Scene
 
 _SAMPLE = 0.02  # [s] between the points of the lines on the floor
 _DASH = 4  # points of a dash
@@ -42,10 +42,45 @@ def _draw(scene: Scene) -> None:
     if scene.strip:
         _strip(scene, list(views)).save(scene.file)
     else:
-        box = save_distances(Path("plot.png"), scene.motions, width, height // 4)
+        box = _save_distances(Path("plot.png"), scene.motions, width, height // 4)
         plot = np.asarray(Image.open("plot.png").convert("RGB"))
         frames = (_frame(scene, plot, box, halves, k) for k, halves in enumerate(views))
         _encode(scene.file, frames, (width, height), scene.config.rate)
+
+
+def _save_distances(
+    path: Path, motions: Mapping[str, Motion], width: int, height: int
+) -> tuple[int, int, int, int]:
+    """Draw the distance from the reference in the plane by time, for the lower part of a film.
+
+    Args:
+        path: file to write.
+        motions: two motions by title, before and after.
+        width: width of the picture [pixel].
+        height: height of the picture [pixel].
+
+    Returns:
+        Left, top, right and bottom of the axes in the picture [pixel].
+    """
+    dpi = height / 1.2  # the figure is always 1.2 inches high
+    last = max(motion.times[-1] for motion in motions.values())
+    with style.drawing(path, width / dpi, height / dpi, dpi=dpi, legend_columns=0) as figure:
+        axes = figure.subplots()
+        colours = style.rgb_of(motions)
+        for (name, motion), colour in zip(motions.items(), colours, strict=True):
+            upright = motion.times <= motion.fall_time
+            distance = np.where(upright, 100 * motion.distance, np.nan)
+            rms = "fell at once"
+            if upright.any():
+                rms = f"{np.sqrt(np.mean(distance[upright] ** 2)):.1f} cm RMS"
+            line = {"color": np.divide(colour, 255), "linewidth": 2.2}
+            axes.plot(motion.times, distance, **line, label=f"{style.label_of(name)}: {rms}")
+        axes.set_title("distance from the reference [cm]", loc="left")
+        axes.set(xlabel="time [s]", xlim=(0.0, last), ylim=(0.0, None))
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.95), ncols=2, borderaxespad=0.1)
+        figure.draw_without_rendering()
+        box = axes.get_window_extent()
+    return round(box.x0), round(height - box.y1), round(box.x1), round(height - box.y0)
 
 
 def _views(scene: Scene, width: int, height: int) -> Iterator[list[UInt8[np.ndarray, "h w 3"]]]:
