@@ -184,11 +184,11 @@ OF_STRIDER = {  # a change of the strider's TOML
     r"nominal: euler must be a number.*got \[50, 0": ("l.euler = 50", "l.euler = [50, 0, 50]"),
     "robot.toml: model is missing.*MJCF or URDF beside": ('model = "strider.xml"', ""),
     "expert: missing field 'moment'": ("expert.moment = 1.8e-3", ""),
-    "unknown field 'weld'.* a robot as published is converted once, by hector robot .*/robot.toml": (
+    "unknown field 'weld'.* converted once, by hector robot .*/robot.toml --out FOLDER": (
         "[joints]",
         '[joints]\nweld = ["waist"]',
     ),
-    "feet.left: unknown field 'body'.*by hector robot": (
+    "feet: left: unknown field 'body'.*by hector robot": (
         'left = { point = "left_sole"',
         'left = { body = "a"',
     ),

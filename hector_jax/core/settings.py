@@ -222,8 +222,8 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
         types = [x for x in (type_, *get_args(type_)) if isinstance(x, type)]
         inner: Any = next(filter(is_dataclass, types), None)
         if inner and get_origin(type_) is dict and isinstance(value, Mapping):
-            named = ((key, f"{where}: {name}.{key}") for key in value)
-            values[name] = {key: from_table(at, inner, value[key]) for key, at in named}
+            named = value.items()
+            values[name] = {n: from_table(f"{where}: {name}: {n}", inner, x) for n, x in named}
             continue
         if inner and value is not None:
             values[name] = from_table(f"{where}: {name}", inner, value)

@@ -49,11 +49,11 @@ from hector_jax.importing.soles import Sole, find_soles
 from hector_jax.importing.stand import standing_pose
 from hector_jax.importing.survey import Survey, survey_file
 from hector_jax.robot.description import (
+    HECTOR_NAMES,
     MAX_BYTES,
     Description,
     Joints,
     description_of,
-    hector_names,
     model_name,
 )
 from hector_jax.robot.model import Robot, build_model, conversion, robot_of
@@ -123,7 +123,7 @@ def _stages(
     source, toml, own = path.parent / found.table["model"], path.with_suffix(".toml"), found.table
     with _told_of(source, model):
         if robot := _in_standard_form(path, own):
-            names = {key: x for key, x in hector_names().items() if key not in own}
+            names = {key: x for key, x in HECTOR_NAMES.items() if key not in own}
             found = found._replace(table=own | names)
         else:
             file, named = read_file(source), _named_legs(path, own)

@@ -21,10 +21,10 @@ from hector_jax.core.inputs import InputError, expect, listed, require
 from hector_jax.core.trajectory import FEET
 from hector_jax.robot.description import Description, convert_by
 from hector_jax.robot.mjcf import TIME_STEP
-from hector_jax.robot.poses import lowest_points, standing_data, trunk_body
+from hector_jax.robot.poses import standing_data, trunk_body
 
 _TOLERANCE = 1e-4  # [m]: between the contacts of different feet; angles in files have few digits
-ON_FLOOR = 1e-3  # [m]: largest distance of a sole from the floor
+_ON_FLOOR = 1e-3  # [m]: largest distance of a sole from the floor
 _OVER_FEET = 5e-3  # [m]: of the centre of mass outside the contacts; a point spans no length
 _MOST_FRICTION = 0.2  # of the robot's geoms; MuJoCo takes the larger friction of two geoms
 SHAPES = tuple(range(int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_BOX) + 1))
@@ -47,45 +47,43 @@ def check_form(description: Description, model: mujoco.MjModel) -> None:
             of the form, and the command that converts it.
     """
     path, remedy = description.model, f"; {convert_by(description.path)}"
-    named = [("keyframe", description.standing, model.key, model.nkey)]
-    named += [("joint", name, model.joint, model.njnt) for name in description.joints]
-    for foot in description.feet:
-        named.append(("site", foot.point, model.site, model.nsite))
-        named += [("geom", name, model.geom, model.ngeom) for name in foot.contacts]
-    for kind, name, part, count in named:
-        require(path, kind, name, [part(i).name for i in range(count)], remedy)
+    for kind, names, part, count in (
+        ("keyframe", [description.standing], model.key, model.nkey),
+        ("joint", description.joints, model.joint, model.njnt),
+        ("site", [foot.point for foot in description.feet], model.site, model.nsite),
+        ("geom", sum((foot.contacts for foot in description.feet), ()), model.geom, model.ngeom),
+    ):
+        known = [part(i).name for i in range(count)]
+        for name in names:
+            require(path, kind, name, known, remedy)
     for text in (*_not_of_robot(description, model), *_not_of_world(description, model)):
         raise InputError(f"{path}: not in the standard form: {text}{remedy}")
 
 
 def _not_of_robot(description: Description, model: mujoco.MjModel) -> Iterator[str]:
     """Yield what bodies, joints and motors have not of the standard form."""
-    joints = mujoco.mjtJoint
-    names = [model.joint(j).name for j in range(model.njnt)]
-    free = [i for i, kind in enumerate(model.jnt_type) if kind == joints.mjJNT_FREE]
-    if free != [0] or tuple(names[1:]) != description.joints:
+    names, kinds = [model.joint(j).name for j in range(model.njnt)], mujoco.mjtJoint
+    free = np.flatnonzero(model.jnt_type == kinds.mjJNT_FREE)
+    if [*free] != [0] or tuple(names[1:]) != description.joints:
         yield f"joints are {listed(names)}, expected a free one, then {listed(description.joints)}"
         return
     count, hinges = description.leg_joints, np.arange(1, model.njnt)
     above = np.where((hinges - 1) % count == 0, 1, hinges)  # the trunk, or the body before
-    if not (
-        model.nbody == model.njnt + 1
-        and np.array_equal(model.jnt_bodyid, np.arange(1, model.nbody))
-        and np.array_equal(model.body_parentid[2:], above)
-    ):
+    bodies = [*model.jnt_bodyid] == [*range(1, model.nbody)]
+    if not (bodies and np.array_equal(model.body_parentid[2:], above)):
         yield "expected a body for each joint and no other, leg by leg from the trunk down"
         return
-    if np.any(model.jnt_type[1:] != joints.mjJNT_HINGE) or not np.all(model.jnt_limited[1:]):
+    if np.any(model.jnt_type[1:] != kinds.mjJNT_HINGE) or not np.all(model.jnt_limited[1:]):
         yield "expected hinges with a range"
     if np.any(model.jnt_pos) or np.any(model.qpos0[7:]):
         yield "expected each joint in the origin of its body, and no ref"
     span, force = model.actuator_ctrlrange, model.actuator_forcerange
+    motor = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE)
+    own = model.actuator_gaintype, model.actuator_biastype, model.actuator_dyntype
     if not (
         np.array_equal(model.actuator_trnid[:, 0], hinges)
         and np.all(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
-        and np.all(model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
-        and np.all(model.actuator_biastype == mujoco.mjtBias.mjBIAS_NONE)
-        and np.all(model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE)
+        and np.all(np.transpose(own) == motor)
         and np.all(model.actuator_gainprm[:, 0] == 1.0)
         and np.all(model.actuator_gear[:, 0] == 1.0)
         and np.all(model.actuator_ctrllimited)
@@ -188,20 +186,22 @@ def check_standing(description: Description, model: mujoco.MjModel) -> None:
             raise InputError(f"{path}: {text}")
     feet, legs = description.feet, description.legs
     spheres = [name for foot in feet for name in foot.contacts]
-    heights = lowest_points(data, spheres)
+    heights = [data.geom(x).xpos[2] - model.geom(x).size[0] for x in spheres]
     low = min(heights)
     offsets = (f"{name} {1e3 * (h - low):.1f}" for name, h in zip(spheres, heights, strict=True))
     text = "standing, the soles are not level: contacts above the lowest one [mm]: "
-    text += f"{', '.join(offsets)}; expected at most {1e3 * ON_FLOOR:g}: change the standing angles"
-    expect(path, max(heights) - low <= ON_FLOOR, text)
+    text += (
+        f"{', '.join(offsets)}; expected at most {1e3 * _ON_FLOOR:g}: change the standing angles"
+    )
+    expect(path, max(heights) - low <= _ON_FLOOR, text)
     text = f"{key} has the soles {low:.4g} m above the floor; {convert_by(description.path)}"
-    expect(path, abs(low) <= ON_FLOOR, text)
+    expect(path, abs(low) <= _ON_FLOOR, text)
     for contact in data.contact:
         bodies = model.geom_bodyid[contact.geom]
         sole = any(model.geom(g).name in spheres for g in contact.geom)
         text = f"{key} has body {model.body(bodies.max()).name!r} {-contact.dist:.3g} m below the "
         text += "floor, expected nothing there but soles: change the standing angles or the shape"
-        expect(path, sole or bodies.min() or contact.dist > -ON_FLOOR, text)
+        expect(path, sole or bodies.min() or contact.dist > -_ON_FLOOR, text)
     x, y, _ = np.array([data.site(foot.point).xpos for foot in feet]).T
     pairs = [(i, i + 1, "y", y, "left") for i in range(0, len(feet), 2)]
     for i, j, axis, at, word in pairs + [(i, i + 2, "x", x, "ahead") for i in range(len(feet) - 2)]:

@@ -24,8 +24,7 @@ description is a static field of its `Robot` under jit. Published robots have mo
 (`importing.draft`), with which `hector robot` brings them into this form.
 """
 
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -34,7 +33,7 @@ import jax
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import NOT_NEGATIVE, POSITIVE, check, from_table, read_toml
 from hector_jax.core.trajectory import FEET, MAX_TILT, MIN_HEIGHT
-from hector_jax.robot.numbers import Number, read_numbers
+from hector_jax.robot.numbers import Number
 
 _PACKAGE = Path(__file__).parents[1]
 _INSTALLED = _PACKAGE / "assets"  # the folder in a wheel
@@ -258,7 +257,7 @@ class _File:
     loss: dict[str, float] | None = None
     tuning: TuningSettings = TuningSettings()
     plants: PlantSizes = PlantSizes()
-    numbers: dict[str, dict] | None = None
+    numbers: dict[str, Number] = field(default_factory=dict)
 
 
 def model_name(path: Path, table: dict[str, Any]) -> str:
@@ -274,6 +273,14 @@ def model_name(path: Path, table: dict[str, Any]) -> str:
         text = f"model must name a file beside it, got {short_repr(name)}"
         raise InputError(f"{path}: {text}")
     return name
+
+
+_TABLE = read_toml(DESCRIPTION_PATH, "the robot description", MAX_BYTES)
+HECTOR_NAMES = {key: _TABLE[key] for key in ("joints", "feet", "standing")}
+HECTOR_NAMES["joints"] = {
+    leg: _TABLE["joints"][leg] for leg in FEET[2]
+}  # a linkage is HECTOR's own
+"""The part of HECTOR's table that a robot with its names may leave out."""
 
 
 def read_description(path: Path) -> Description:
@@ -295,7 +302,7 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
     Raises:
         InputError: as `read_description`.
     """
-    names = hector_names() | {key: table[key] for key in hector_names() if key in table}
+    names = HECTOR_NAMES | {key: table[key] for key in HECTOR_NAMES if key in table}
     try:
         named = from_table(str(path), Names, names)
     except InputError as error:
@@ -306,6 +313,9 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
     if not name.replace("-", "").replace("_", "").isalnum():
         text = "name must be letters, digits, - and _ (it names a folder)"
         raise InputError(f"{path}: {text}, got {short_repr(name)}")
+    if odd := [name for name in file.numbers if not name.isidentifier()]:
+        text = "the name of a number must be letters, digits and _"
+        raise InputError(f"{path}: numbers: {text}, got {short_repr(odd[0])}")
     sections = {name: getattr(file, name) for name in CONTROL}
     return Description(
         model=path.parent / model_name(path, table),
@@ -322,21 +332,13 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
         loss=_as_tuples(file.loss or {}),
         tuning=file.tuning,
         plants=file.plants,
-        numbers=read_numbers(str(path), file.numbers or {}),
+        numbers=tuple(file.numbers.items()),
     )
 
 
 def convert_by(path: Path) -> str:
     """Return the words that name the command which brings a file into the standard form."""
     return f"a robot as published is converted once, by hector robot {path} --out FOLDER"
-
-
-@cache
-def hector_names() -> dict[str, Any]:
-    """Return the part of HECTOR's table that a robot with its names may leave out."""
-    table = read_toml(DESCRIPTION_PATH, "the robot description", MAX_BYTES)
-    legs = {leg: table["joints"][leg] for leg in FEET[2]}
-    return {"joints": legs, "feet": table["feet"], "standing": table["standing"]}
 
 
 def _as_tuples(value: Any) -> Any:
@@ -346,5 +348,5 @@ def _as_tuples(value: Any) -> Any:
     return tuple(map(_as_tuples, value)) if isinstance(value, list | tuple) else value
 
 
-HECTOR = read_description(DESCRIPTION_PATH)
+HECTOR = description_of(DESCRIPTION_PATH, _TABLE)
 """The default robot, whose plants are drawn if no description is passed."""

@@ -106,8 +106,7 @@ def check_elements(path: Path, root: ElementTree.Element) -> None:
     in_rad = root.tag == "robot" or any(x.get("angle") == "radian" for x in root.iter("compiler"))
     bodies = joints = 0
     for element, label in _labelled(path, root):
-        file = f" of {short_repr(element.get('file'))}" if "file" in element.attrib else ""
-        text = f"<{element.tag}>{file} is not accepted, expected plain bodies"
+        text = f"<{element.tag}> is not accepted, expected plain bodies"
         expect(path, element.tag not in _REFUSED, text)
         bodies += element.tag in ("body", "link")
         joints += element.tag in ("joint", "freejoint") and element.get("type") != "fixed"

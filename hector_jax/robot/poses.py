@@ -1,6 +1,6 @@
 """Kinematics of a compiled model in given poses: at joint angles, and standing."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -48,11 +48,6 @@ def standing_data(description: Description, model: mujoco.MjModel) -> mujoco.MjD
 def trunk_body(model: mujoco.MjModel) -> int:
     """Return the body that the free joint moves."""
     return int(model.jnt_bodyid[0])
-
-
-def lowest_points(data: mujoco.MjData, spheres: Sequence[str]) -> list[float]:
-    """Return the height of the lowest point of each sphere [m]."""
-    return [float(data.geom(s).xpos[2] - data.model.geom(s).size[0]) for s in spheres]
 
 
 def inertia_about(
