@@ -11,6 +11,7 @@ import re
 import struct
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Sequence
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -144,7 +145,9 @@ def resolved(path: Path) -> dict[str, bytes]:
     """
     root, meshes = read_whole(path), {}
     key = "filename" if root.tag == "robot" else "file"
-    folder = next((x.get("meshdir", "") for x in root.iter("compiler") if x.get("meshdir")), "")
+    folders = ("meshdir", "assetdir")
+    compilers = [x for x in root.iter("compiler") if {*folders} & {*x.attrib}]
+    folder = next((x.get("meshdir") or x.get("assetdir", "") for x in compilers), "")
     for part in root.iter("mesh"):
         if file := _find(path, part.get(key, ""), folder):
             content, name = file.read_bytes(), f"meshes/{file.name}"
@@ -154,8 +157,8 @@ def resolved(path: Path) -> dict[str, bytes]:
             if key == "file":
                 part.set("name", part.get("name", file.stem))  # by default that of the file
             part.set(key, name)
-    for part in root.iter("compiler") if meshes else []:
-        part.attrib.pop("meshdir", None)
+    for part, name in product(compilers if meshes else (), folders):
+        part.attrib.pop(name, None)
     return {path.name: ElementTree.tostring(root), **meshes}
 
 

@@ -135,7 +135,7 @@ def _stages(
             joints, lines = guessed_numbers(file, draft)
             table = _merged({"joints": joints}, found.table)
             yield (found := found._replace(table=table, guesses=(*found.guesses, *lines)))
-            standard = to_standard(file, draft_of(toml, table), table["name"])
+            standard = to_standard(file, draft_of(toml, table), str(table["name"]))
             write_file(model, standard.text.encode())
             found = found._replace(standard=standard)
             names = {key: x for key, x in table.items() if key in _NAMES}

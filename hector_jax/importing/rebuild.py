@@ -19,12 +19,11 @@ from hector_jax.core.inputs import expect
 from hector_jax.importing.draft import Draft, PublishedFoot
 from hector_jax.importing.links import Link, Pose, pose_of
 from hector_jax.robot.checks import SHAPES, contact_bits
-from hector_jax.robot.mjcf import TIME_STEP
 
 _RADIUS = 0.01  # [m] of the spheres of soles
-_SCENE = """<mujoco model="{name}">
+_SCENE = """<mujoco>
   <compiler angle="radian"/>
-  <option timestep="{step:g}" integrator="implicitfast" solver="Newton" cone="pyramidal"
+  <option timestep="0.001" integrator="implicitfast" solver="Newton" cone="pyramidal"
           iterations="10" ls_iterations="10"/>
   <visual>
     <global offwidth="1280" offheight="720"/>
@@ -85,7 +84,8 @@ def rebuild(path: Path, draft: Draft, pieces: Pieces, name: str) -> tuple[str, d
     Raises:
         InputError: one line: the body, site or spheres of a foot are not there.
     """
-    root = ElementTree.fromstring(_SCENE.format(name=name, step=TIME_STEP))
+    root = ElementTree.fromstring(_SCENE)
+    root.set("model", name)
     world = root.find("worldbody")
     assert world is not None
     contact, motors, keys = (_add(root, tag) for tag in ("contact", "actuator", "keyframe"))

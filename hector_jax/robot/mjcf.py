@@ -10,7 +10,7 @@ import math
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import product
 from pathlib import Path
 
@@ -73,11 +73,10 @@ def read_mjcf(path: Path, toml: Path) -> ElementTree.Element:
     root = read_elements(path)
     text = f"root element is <{root.tag[:40]}>, expected <mujoco>; {convert_by(toml)}"
     expect(path, root.tag == "mujoco", text)
-    for element in root.iter():
-        files = [name for name in element.attrib if name.startswith("file")]
-        named = f" of {short_repr(element.get(files[0]))}" if files else ""
-        text = f"<{element.tag}>{named} is of another file; {convert_by(toml)}"
-        expect(path, not files and element.tag != "include", text)
+    for element in root.iter():  # as <include file=..>
+        for file in (x for name, x in element.attrib.items() if name.startswith("file")):
+            text = f"<{element.tag}> of {short_repr(file)} is of another file"
+            raise InputError(f"{path}: {text}; {convert_by(toml)}")
     check_elements(path, root)
     return root
 
@@ -173,7 +172,9 @@ def _expected(tag: str, name: str, value: str, in_rad: bool) -> str | None:
         size = re.fullmatch(r"(\d{1,12})([KMG]?)", value)
         valid = value == "-1" or (size and int(size[1]) * _MEMORY[size[2]] <= _MOST_MEMORY)
         return None if valid else "at most 1G"
-    numbers = _numbers(value)
+    numbers: list[float] | None = None
+    with suppress(ValueError):
+        numbers = list(map(float, value.split()))
     allowed = _RANGES_OF.get((tag, name)) or _RANGES.get(name)
     if allowed and not (numbers and all(number in allowed for number in numbers)):
         return f"numbers {allowed}"
@@ -185,11 +186,3 @@ def _expected(tag: str, name: str, value: str, in_rad: bool) -> str | None:
     if pair and (numbers is None or len(numbers) != 2 or numbers[0] > numbers[1]):
         return "two numbers, the lower one first"
     return None
-
-
-def _numbers(text: str) -> list[float] | None:
-    """Return the numbers in a text, None if it contains anything else."""
-    try:
-        return list(map(float, text.split()))
-    except ValueError:
-        return None
