@@ -31,11 +31,6 @@ class Pose(NamedTuple):
         return Pose(self.R.T @ other.R, self.R.T @ (other.p - self.p))
 
     @property
-    def inverse(self) -> "Pose":
-        """The pose of the outer frame in this one."""
-        return self.to(Pose())
-
-    @property
     def quat(self) -> Float[np.ndarray, "4"]:
         """The orientation as a quaternion."""
         quat = np.zeros(4)

@@ -57,18 +57,13 @@ class Pieces(NamedTuple):
     limits: Sequence[float]  # [N m] of the motors
     trunk_quat: Float[np.ndarray, "4"]  # standing
 
-    def up(self, link: Link) -> Float[np.ndarray, "3"]:
-        """Return the world's z in the frame of a link, standing."""
-        return self.standing(link).R[2]
-
     def standing(self, link: Link) -> Pose:
         """Return the pose of a link in the world, standing, the trunk's origin at the world's."""
-        body, pose = next(iter(link.bodies.items()))
-        trunk, place = next(iter(self.links[0].bodies.items()))
-        frames = [
-            Pose(self.file.xmat[b].reshape(3, 3), self.file.xpos[b]) @ pose.inverse
-            for b, pose in ((trunk, place), (body, pose))
-        ]
+        frames = []
+        for one in (self.links[0], link):
+            body, moves = next(iter(one.bodies)), one.joint >= 0
+            place = self.file.xanchor[one.joint] if moves else self.file.xpos[body]
+            frames.append(Pose(self.file.xmat[body].reshape(3, 3), place))
         return pose_of(np.zeros(3), self.trunk_quat) @ frames[0].to(frames[1])
 
 
@@ -105,7 +100,7 @@ def rebuild(path: Path, draft: Draft, pieces: Pieces, name: str) -> tuple[str, d
         text += f"{draft.all_joints[last - 1]!r} moves: "
         contacts, point = _sole(path, foot, pieces, link, text)
         heights += (pieces.standing(link).p + contacts @ pieces.standing(link).R.T)[:, 2].tolist()
-        feet[side] = _add_foot(bodies[last], side, contacts, point, pieces.up(link))
+        feet[side] = _add_foot(bodies[last], side, contacts, point, pieces.standing(link).R[2])
     for joint, limit in zip(draft.all_joints, pieces.limits, strict=True):
         span = [-limit, limit]
         _add(motors, "motor", name=joint, joint=joint, ctrlrange=span, forcerange=span)
@@ -253,7 +248,7 @@ def _sole(
     spheres = {
         model.geom(g).name: link.bodies[b].p
         + link.bodies[b].R @ model.geom_pos[g]
-        - model.geom_size[g, 0] * pieces.up(link)
+        - model.geom_size[g, 0] * pieces.standing(link).R[2]
         for g, b in enumerate(model.geom_bodyid.tolist())
         if b in link.bodies and model.geom_type[g] == _SPHERE
     }
