@@ -38,7 +38,7 @@ tune: $(STAMP) ## tune and evaluate: make tune TRAJ=straight|c|s|all, TRAJ="c s"
 MODELS := --plant light heavy examples/hector-v2/robot.toml
 
 verdict: $(STAMP) ## sets in all engines and models: make verdict WEIGHTS="nominal mine.json"
-	@$(BIN)/hector evaluate --traj all --engine all $(MODELS) --out runs/verdict --weights $(or $(WEIGHTS),nominal expert best)
+	@$(BIN)/hector evaluate --traj all --engine all $(MODELS) --out runs/verdict --weights $(or $(WEIGHTS),nominal expert shipped)
 
 grfm: $(STAMP) ## how well the nets predict the ground forces: runs/grfm/report.md
 	@$(BIN)/hector steps grfm

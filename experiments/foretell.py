@@ -5,7 +5,7 @@ these walk. The pairs are the calibration of `hector log foretell`:
 
     python experiments/foretell.py --robots hector=- quadruped=examples/quadruped/robot.toml
 
-Sets are nominal, expert, and random steps from nominal, some of them towards `best`. The
+Sets are nominal, expert, and random steps from nominal, some of them towards `shipped`. The
 calibration is of plants of hfs-varied, which no verdict uses: OUT/foretold.json is what the package
 has. On plants of a verdict the report counts the intervals that hold what was walked.
 """
@@ -29,7 +29,7 @@ from hector_jax.control.parameters import GROUPS as GROUPS_OF_NUMBERS
 from hector_jax.control.parameters import TUNABLES, steps_between, weights_after
 from hector_jax.control.reference import Command, named_command
 from hector_jax.control.weights import Weights, expert, nominal
-from hector_jax.control.weights_file import best
+from hector_jax.control.weights_file import shipped
 from hector_jax.core.console import bar, say
 from hector_jax.core.environment import code_hash
 from hector_jax.core.files import as_json, write_file
@@ -121,12 +121,12 @@ def drawn_sets(
 ) -> list[Weights]:
     """Draw weight sets: nominal, expert, or random steps from nominal and of the integral gains.
 
-    Half of HECTOR's go some way towards `best`, as a tuning does.
+    Half of HECTOR's go some way towards `shipped`, as a tuning does.
     """
     start, rng, sets = nominal(robot), np.random.default_rng(seed), []
     zero = np.asarray(steps_between(start, start))
     ours = robot.description == describe()
-    way = np.asarray(steps_between(start, best())) if ours else zero
+    way = np.asarray(steps_between(start, shipped())) if ours else zero
     for _ in range(count):
         steps, known = rng.normal(0.0, SPREAD, len(zero)), rng.random()
         if rng.random() < 0.5:
@@ -287,7 +287,7 @@ def carried_pairs(columns: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """
     first, *others = columns
     parts: dict[tuple[str, int], list[list[float]]] = {}
-    for name, (i, column) in product(("expert", "best"), enumerate(others)):
+    for name, (i, column) in product(("expert", "shipped"), enumerate(others)):
         parts[name, i] = []
         for traj, sets in column["trajectories"].items():
             walked = changes_of(sets, name)

@@ -1,9 +1,9 @@
 """How low can one weight set go on many plants? A search with thousands of walks.
 
 CMA-ES over the mean loss on several plants of `hfs-varied` and all three commands at once, from
-`best` or another start, in the steps of the tuner (`parameters.stepped`). Its answer is the mean of
-the last distribution. It walks on the plants of the search and on as many others: what it gains on
-the former alone is fitted to them.
+`shipped` or another start, in the steps of the tuner (`parameters.stepped`). Its answer is the mean
+of the last distribution. It walks on the plants of the search and on as many others: what it gains
+on the former alone is fitted to them.
 
     python experiments/many_plants.py --tune weights
     python experiments/many_plants.py --tune all --generations 40
@@ -27,7 +27,7 @@ from jaxtyping import Float
 from hector_jax.control.parameters import step_bounds, tunables, weights_after
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import Weights, expert, nominal
-from hector_jax.control.weights_file import best, load_weights, save_weights, weights_tree
+from hector_jax.control.weights_file import load_weights, save_weights, shipped, weights_tree
 from hector_jax.core.console import bar
 from hector_jax.core.environment import code_hash
 from hector_jax.core.files import make_folder
@@ -57,7 +57,7 @@ class Flags(lib.Flags):
     """What to search."""
 
     tune: tuple[str, ...] = ("weights",)  # as `hector tune --tune`
-    start: Path | None = None  # a weights file; by default the set `best`
+    start: Path | None = None  # a weights file; by default the set `shipped`
     plants: Annotated[int, AT_LEAST_ONE] = 16  # to search on, and as many others to judge by
     first_plant: Annotated[int, SEED] = 100  # seed of the first one
     generations: Annotated[int, AT_LEAST_ONE] = 30
@@ -156,7 +156,7 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
 def main(flags: Flags) -> Path:
     """Search, and write report.md, many-plants.json and the weights."""
     robot, engine = jax.tree.map(np.asarray, load_robot(flags.robot)), choose_engine(flags.engine)
-    start = best(robot) if flags.start is None else load_weights(flags.start, robot)
+    start = shipped(robot) if flags.start is None else load_weights(flags.start, robot)
     config = tunings.tune_config(robot, others=tunables(flags.tune))
     commands = {name: named_command(name) for name in COMMANDS}
     folder, count, first = flags.out / "-".join(flags.tune), flags.plants, flags.first_plant

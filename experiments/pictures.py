@@ -3,7 +3,7 @@
     method        how a tuning works, as a block diagram
     own           a controller of one's own: what its user provides, and the first minutes
     film          the robot with plain and with tuned weights, side by side
-    before-after  errors along one walk of the sets nominal, expert and best
+    before-after  errors along one walk of the sets nominal, expert and shipped
     foretold      loss walked by loss foretold, with intervals
     race          loss by the number of walks, against CMA-ES and Bayesian optimisation
     robots        four robots walking
@@ -47,7 +47,7 @@ from hector_jax import (
     walk,
     walk_config,
 )
-from hector_jax.control.weights_file import best
+from hector_jax.control.weights_file import shipped
 from hector_jax.core.console import exit_code, say
 from hector_jax.core.settings import check
 from hector_jax.core.trajectory import Trajectory
@@ -218,7 +218,7 @@ def draw_own(path: Path) -> None:
 
 def draw_film(path: Path) -> None:
     """Film the plain and the tuned weights on one plant."""
-    robot, pair = load_robot(), {"nominal": nominal(), "best": best()}
+    robot, pair = load_robot(), {"nominal": nominal(), "shipped": shipped()}
     walks = {name: walk_of(robot, weights, standin(0), 4.0) for name, weights in pair.items()}
     config = VideoConfig(width=720, height=488, rate=12)
     write_film(path, robot, motions(robot, walks), config)
@@ -226,7 +226,7 @@ def draw_film(path: Path) -> None:
 
 def draw_before_after(path: Path) -> None:
     """Draw the distance from the reference and the error in pitch along one walk of each set."""
-    sets = {"nominal": nominal(), "expert": expert(), "best": best()}
+    sets = {"nominal": nominal(), "expert": expert(), "shipped": shipped()}
     with drawing(path, 7.2, 2.6, dpi=190.0) as figure:
         left, right = figure.subplots(1, 2)
         for name, look in looks_of(sets).items():
@@ -262,8 +262,8 @@ def draw_race(path: Path) -> None:
 
 
 def draw_robots(path: Path) -> None:
-    """Draw HECTOR with its set best, and three robots of the examples with plain weights."""
-    tiles = [_still(load_robot(), best(), "HECTOR: best")]
+    """Draw HECTOR with its set shipped, and three robots of the examples with plain weights."""
+    tiles = [_still(load_robot(), shipped(), "HECTOR: shipped")]
     for name in ("strider", "quadruped", "humanoid"):
         robot = load_robot(ROOT / "examples" / name / "robot.toml")
         tiles.append(_still(robot, nominal(robot), f"{name}: nominal"))
@@ -300,7 +300,7 @@ def draw_page(path: Path, run: Path) -> None:
 
 def draw_live(path: Path) -> None:
     """Take a picture of the page of `hector view --live`, after some seconds of walking."""
-    _take_picture(path, ["--live", "--weights", "nominal", "best"], "Real-time factor", 25.0)
+    _take_picture(path, ["--live", "--weights", "nominal", "shipped"], "Real-time factor", 25.0)
 
 
 def draw_live_film(path: Path) -> None:
@@ -314,11 +314,11 @@ def draw_live_film(path: Path) -> None:
         8.0: lambda tab: tab.click("from behind"),
     }
     frames: list[Image.Image] = []
-    flags = ["--live", "--weights", "best"]
+    flags = ["--live", "--weights", "shipped"]
     with _opened_page(flags, "Real-time factor", 20.0, height=720) as tab:
 
         def now() -> float:
-            return float(re.search(r"best: (-?[\d.]+) s; ", tab.text())[1])  # pyright: ignore
+            return float(re.search(r"shipped: (-?[\d.]+) s; ", tab.text())[1])  # pyright: ignore
 
         tab.fill("speed [real time]", "0.1")
         start = shown = now()

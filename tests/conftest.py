@@ -21,7 +21,7 @@ os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
-from hypothesis import configuration  # noqa: E402
+from hypothesis import configuration, settings  # noqa: E402
 
 from hector_jax.core.runtime import setup_jax  # noqa: E402
 
@@ -29,6 +29,9 @@ setup_jax()
 sys.path.append(str(Path(__file__).parents[1] / "experiments"))  # scripts import their helpers so
 # what it notes about the code names the machine's paths: not into the checkout
 configuration.set_hypothesis_home_dir(Path(tempfile.gettempdir()) / "hypothesis")
+# the same examples in each run, however slow the machine
+settings.register_profile("suite", deadline=None, derandomize=True)
+settings.load_profile("suite")
 
 
 @pytest.fixture(autouse=True, scope="module")

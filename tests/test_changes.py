@@ -17,7 +17,7 @@ from test_walk import walk_and_gain
 from hector_jax import InputError, Job, TuneConfig, expert, load_robot, walk
 from hector_jax.control import GaitConfig, WalkConfig, named_command, nominal, walk_config
 from hector_jax.control.slip import SlipConfig, feel, first_grip
-from hector_jax.control.weights_file import best
+from hector_jax.control.weights_file import shipped
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.world import build_world, hfs, ideal, standing_qpos
@@ -125,7 +125,7 @@ def test_a_foot_that_moves_far_in_its_stance_has_slipped_and_the_friction_grows_
 def test_a_floor_that_turns_slippery_is_walked_with_less_friction():
     config, floor = walk_config(ROBOT), (Change(1.0, 3.0, floor_friction=0.45),)
     careless = replace(config, slip=replace(config.slip, share=1.0))
-    job = Job(best(), named_command("s"), hfs())
+    job = Job(shipped(), named_command("s"), hfs())
     felt, not_felt = (walk_with_changes(c, ROBOT, job, floor) for c in (config, careless))
     assert not np.any(felt.fallen)
 

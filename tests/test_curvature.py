@@ -14,7 +14,7 @@ from hector_jax import InputError, Job, RolloutConfig, Scenario, TuneConfig, hfs
 from hector_jax.control import MpcConfig, Squares, StateCost, named_command, nominal
 from hector_jax.control.parameters import gradient_by_steps, stepped
 from hector_jax.control.weights import direction_names, expert, vector_to_weights, weights_to_vector
-from hector_jax.control.weights_file import best, load_weights, save_weights
+from hector_jax.control.weights_file import load_weights, save_weights, shipped
 from hector_jax.core.trajectory import State, Wrench
 from hector_jax.tuning.curvature import determined, least_squares_jit
 from hector_jax.tuning.difftune import init, model_slope, trial_weights, tune, tune_step, update
@@ -215,7 +215,7 @@ def test_a_grounded_rollout_is_its_walk_with_the_slope_of_differences_and_a_matr
 @pytest.mark.parametrize("noise", [False, True])
 def test_with_the_weights_of_a_log_the_planned_commands_are_those_of_the_log(noise):
     """With integral action, whose memory is not empty when the log begins, and a wrong estimate."""
-    config, weights, command = BRIEF.walk, best(), named_command("s")
+    config, weights, command = BRIEF.walk, shipped(), named_command("s")
     plant = drawn_plants(ROBOT, 1)[0] if noise else hfs()
     seconds = BRIEF.ticks * config.gait.tick
     walked = walk(config, ROBOT, Job(weights, command, plant, seconds, seed=3))

@@ -104,7 +104,7 @@ PAIRS = [
     "hector export runs/paper",
     "hector tune --traj c --walks 4 --safe 0.05 --out runs/safe",
     "hector tune --resume runs/safe",
-    "hector tune --traj straight --start best --alpha auto --json --out runs/judged",
+    "hector tune --traj straight --start shipped --alpha auto --json --out runs/judged",
     "hector tune --traj straight --net data/more.npz --out runs/net",
     "hector view runs/net",
     "hector tune --resume runs/net",
@@ -124,10 +124,12 @@ INPUTS = {
         "hector walk --walker mine.py --robot mine.toml --out log.npz"
     ],
     "hector log check mine.npz --traj straight": [A_WALK.format("straight", "mine")],
-    "hector log foretell mine.npz --walked nominal --weights expert best": [
+    "hector log foretell mine.npz --walked nominal --weights expert shipped": [
         A_WALK.format("straight", "mine")
     ],
-    "hector log foretell s.npz --traj s --walked nominal --weights best": [A_WALK.format("s", "s")],
+    "hector log foretell s.npz --traj s --walked nominal --weights shipped": [
+        A_WALK.format("s", "s")
+    ],
     "hector evaluate --walker mine.py --robot mine.toml --traj c --weights mine.json best.json": [
         "hector walk --walker mine.py --robot mine.toml --out log.npz"
     ],

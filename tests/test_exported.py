@@ -27,7 +27,7 @@ from hector_jax.control.controller import walk_config
 from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal
-from hector_jax.control.weights_file import best
+from hector_jax.control.weights_file import shipped
 from hector_jax.core.environment import versions
 from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError
@@ -76,7 +76,7 @@ def test_the_plug_in_of_ros2_control_walks_as_the_controller_does(tmp_path):
     if shutil.which("g++") is None or not list(home.glob("libmujoco.so*")):
         pytest.skip("there is no C++ compiler or no libmujoco.so")
     own = (HERE / "exported_ros2.cpp").read_text()
-    for file, text in with_prefix(source_of(best()) | {"test.cpp": own}, "left").items():
+    for file, text in with_prefix(source_of(shipped()) | {"test.cpp": own}, "left").items():
         write_file(tmp_path / file, text.encode())
     folder = tmp_path / "ros2_control"
     flags = f"-std=c++17 -O2 -Wall -Wextra -Werror -I. -I{HERE}/ros2 -I{home}/include"
@@ -98,7 +98,7 @@ def test_the_plug_in_of_ros2_control_walks_as_the_controller_does(tmp_path):
     given = dict(re.findall(r"^    (\w+): (.*)$", text, re.MULTILINE))
     assert (given["type"], json.loads(given["R_force"])) == (
         "left_ros2/Walk",
-        np.ravel(best().R.force).tolist(),
+        np.ravel(shipped().R.force).tolist(),
     )
 
 
@@ -222,7 +222,7 @@ def held(tmp_path_factory):
     libraries = list(home.glob("libmujoco.so*"))
     if not libraries:
         pytest.skip("this MuJoCo has no libmujoco.so")
-    for file, text in source_of(best()).items():
+    for file, text in source_of(shipped()).items():
         write_file(folder / file, text.encode())
     words = ["cc", "-std=c99", "-O2", f"-I{home}/include", "-I.", HERE / "exported_held.c"]
     words += ["controller.c", *libraries, f"-Wl,-rpath,{home}", "-lm", "-o", "held"]

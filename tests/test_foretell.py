@@ -161,15 +161,15 @@ def test_the_command_tells_errors_with_intervals_or_why_a_log_foretells_nothing(
     log, seconds = tmp_path / "log.npz", ("--seconds", "2")
     assert call(monkeypatch, "walk", "--world", "hfs", *seconds, "--out", log) == 0
     capsys.readouterr()
-    words = "log", "foretell", log, *seconds, "--weights", "expert", "best"
+    words = "log", "foretell", log, *seconds, "--weights", "expert", "shipped"
     assert call(monkeypatch, *words, "--json") == 0
     result = json.loads(capsys.readouterr().out)
     assert result["calibration"] == HERE
-    for name in ("expert", "best"):
+    for name in ("expert", "shipped"):
         plane = result["sets"][name]["plane"]
         assert plane["low"] < plane["value"] < plane["high"]
         assert not result["sets"][name]["falls"]
-    assert result["sets"]["best"]["L"]["change"]["high"] < 0.0
+    assert result["sets"]["shipped"]["L"]["change"]["high"] < 0.0
     assert call(monkeypatch, *words) == 0
     told = capsys.readouterr().out
     assert "nominal (walked)" in told

@@ -18,7 +18,7 @@ from hector_jax import Job, walk
 from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal, weights_to_vector
-from hector_jax.control.weights_file import best, load_weights, weights_tree
+from hector_jax.control.weights_file import load_weights, shipped, weights_tree
 from hector_jax.robot.model import compile_model
 from hector_jax.sim.world import hfs, hfs_even
 from hector_jax.view.live import Frame, Session, count_compilations
@@ -36,8 +36,8 @@ def job(weights=None, plant=PLANT, seed=0):
 
 @pytest.fixture(scope="module")
 def session():
-    """A session of `best` that has walked for four seconds."""
-    found = Session(ROBOT, [job(best(ROBOT))])
+    """A session of `shipped` that has walked for four seconds."""
+    found = Session(ROBOT, [job(shipped(ROBOT))])
     go(found, 4.0)
     return found
 
@@ -61,7 +61,7 @@ def test_an_untouched_live_walk_is_the_walk_to_the_bit(plant):
 
 
 def test_nothing_compiles_while_a_person_turns_and_both_sets_walk_on_one_plant():
-    found = Session(ROBOT, [job(), job(best(ROBOT))])
+    found = Session(ROBOT, [job(), job(shipped(ROBOT))])
     found.warm_up()
     compilations = count_compilations()
     go(found, 0.3)
@@ -92,7 +92,7 @@ def test_a_small_push_is_survived_and_a_large_one_ends_in_a_fall_with_its_cause(
 
 
 def test_weights_change_the_errors_and_those_of_the_start_stay_beside_them():
-    found = Session(ROBOT, [job(best(ROBOT))])
+    found = Session(ROBOT, [job(shipped(ROBOT))])
     before = go(found, 2.0).errors
     found.set_weights(0, nominal(ROBOT))
     now = go(found, 6.5)
@@ -212,7 +212,7 @@ def until(seconds, seen):
 def test_a_person_turns_pushes_and_saves_in_a_browser(tmp_path):
     pytest.importorskip("viser", reason="viser, of the extra view, is not installed")
     words = [sys.executable, "-m", "hector_jax.cli.main", "view", "--live", "--port", "0"]
-    words += ["--weights", "best"]
+    words += ["--weights", "shipped"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": tmp_path}
     with subprocess.Popen(words, **pipes) as page:
         try:
@@ -226,11 +226,11 @@ def test_a_person_turns_pushes_and_saves_in_a_browser(tmp_path):
                     return re.search(what, one.text())
 
                 def pitch():
-                    row = at(r"best now\s+\S+, \S+, \S+\s+\S+, ([\d.]+), ")
+                    row = at(r"shipped now\s+\S+, \S+, \S+\s+\S+, ([\d.]+), ")
                     return float(row[1]) if row else None
 
                 def walked():
-                    told = at(r"best: (-?[\d.]+) s; QP solved")
+                    told = at(r"shipped: (-?[\d.]+) s; QP solved")
                     return float(told[1]) if told else -1.0
 
                 until(300, lambda: walked() > 5.0)
@@ -245,15 +245,15 @@ def test_a_person_turns_pushes_and_saves_in_a_browser(tmp_path):
                 until(120, lambda: walked() > now + 3.0)
                 tab.fill("push [N]", "300")
                 tab.click("from behind")
-                until(120, lambda: at("best: fell after"))
-                until(30, lambda: at("best: fell after", other))
+                until(120, lambda: at("shipped: fell after"))
+                until(30, lambda: at("shipped: fell after", other))
                 tab.click("Reset: stand at the start again")
                 until(60, lambda: walked() > -1.0)
                 tab.click("Save these weights")
                 until(30, lambda: at("hector view --live --weights live.json"))
                 saved = load_weights(tmp_path / "live.json", ROBOT)
                 np.testing.assert_array_equal(
-                    weights_to_vector(saved), weights_to_vector(best(ROBOT))
+                    weights_to_vector(saved), weights_to_vector(shipped(ROBOT))
                 )
         finally:
             page.send_signal(signal.SIGINT)

@@ -238,6 +238,6 @@ def test_commands_take_the_file_and_write_a_copy(path, monkeypatch, capsys):
     assert call(*line, folder / "tuned.json") == 0
     other = capsys.readouterr().out
     assert found == other
-    assert call("export", "best", "--into", path, "--out", folder) == 2
+    assert call("export", "shipped", "--into", path, "--out", folder) == 2
     assert "would be overwritten" in capsys.readouterr().err
     assert path.read_bytes() == before

@@ -417,7 +417,7 @@ def test_a_file_of_numbers_is_filled_in_in_its_order_and_units(tmp_path, monkeyp
     assert call(monkeypatch, *line) == 0
     assert (tmp_path / "gains.yaml").read_text() == "q: [50.0, 50.0]\nr: 1.00\n"
     capsys.readouterr()
-    assert call(monkeypatch, "export", "best", *line[2:], "--json") == 0  # that comes along
+    assert call(monkeypatch, "export", "shipped", *line[2:], "--json") == 0  # that comes along
     assert json.loads(capsys.readouterr().out) == {"file": str(tmp_path / "gains.yaml")}
     assert float((tmp_path / "gains.yaml").read_text()[4:].split(",")[0]) > 0.0
 

@@ -53,7 +53,7 @@ def test_the_wheel_walks_in_an_environment_of_its_own(tmp_path):
     assert told["faults"] == []
     assert told["robot"].startswith(f"{packages}/hector_jax/assets/hector.xml")
     assert "commit" not in told
-    words = ("walk", "--world", "hfs", "--seconds", "1", "--weights", "best", "--json")
+    words = ("walk", "--world", "hfs", "--seconds", "1", "--weights", "shipped", "--json")
     walked = json.loads(call(hector, *words, cwd=home))
     assert (walked["seconds"], walked["fell"]) == (pytest.approx(1.0), False)
     assert list(home.iterdir()) == []

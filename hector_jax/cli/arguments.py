@@ -30,7 +30,7 @@ from hector_jax.control.parameters import Tunable, numbers_of
 from hector_jax.control.reference import COMMANDS
 from hector_jax.control.trajectories import NamedCommand, beyond, limits
 from hector_jax.control.weights import Weights, expert, nominal
-from hector_jax.control.weights_file import best, load_weights, with_numbers
+from hector_jax.control.weights_file import load_weights, shipped, with_numbers
 from hector_jax.core.console import say
 from hector_jax.core.files import as_json
 from hector_jax.core.inputs import InputError
@@ -57,7 +57,7 @@ def weights_by_name(text: str, robot: Robot) -> Weights:
     Raises:
         InputError: the file holds none.
     """
-    named = {"nominal": nominal, "expert": expert, "best": best}
+    named = {"nominal": nominal, "expert": expert, "shipped": shipped}
     if text in named:
         return with_numbers(named[text](robot), robot)
     return load_weights(Path(text), robot)

@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 BASELINES = ("nominal", "expert")
 OTHER_MASSES = {"light": 0.9, "heavy": 1.1}  # models: the robot's own with all masses times this
-NAMED_WEIGHTS = (*BASELINES, "best")
+NAMED_WEIGHTS = (*BASELINES, "shipped")
 
 
 class PathKind(Enum):
@@ -24,9 +24,9 @@ class PathKind(Enum):
     BAG = "a file, or the folder of a bag"
     RUN = "the folder of a run of `hector tune`"
     FOLDER = "a folder"  # may not exist yet
-    EXPORTABLE = "a run folder, best or a weights file"
-    WEIGHTS = "nominal, expert, best or a weights file"
-    SETS = "nominal, expert, best, a weights file, or a folder of one for each trajectory"
+    EXPORTABLE = "a run folder, shipped or a weights file"
+    WEIGHTS = "nominal, expert, shipped or a weights file"
+    SETS = "nominal, expert, shipped, a weights file, or a folder of one for each trajectory"
     TRAJECTORY = "a name or a TOML file"
     MODEL = "light, heavy or a TOML file of a robot"
     ROBOT = "a robot's TOML file: hector robot MODEL --out FOLDER makes one"
@@ -199,7 +199,7 @@ class Tune(Configured, ByWalker, ByPlanner, Parallel):
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
     # trajectories that no set may make 10 % worse, which a --walker walks too
     keep: Trajectories = ()
-    start: Weights = "nominal"  # where to start: nominal, expert, best or a weights file
+    start: Weights = "nominal"  # where to start: nominal, expert, shipped or a weights file
     # weights: Q and R; also footsteps, integral, all, or numbers by name;
     # `best` has the gains of the integral action in any case
     tune: tuple[Tunables, ...] = ("weights",)
@@ -237,7 +237,8 @@ class Propose(ForRobot, ByPlanner, Printed):
 
     folder: Folder  # of this tuning; a later call needs no other flag
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
-    start: Weights = "best"  # weights of the first walk: nominal, expert, best or a weights file
+    # weights of the first walk: nominal, expert, shipped or a weights file
+    start: Weights = "shipped"
     # weights: Q and R; also footsteps, integral, all, or numbers by name
     tune: tuple[Tunables, ...] = ("weights",)
 
@@ -263,7 +264,7 @@ class Evaluate(Configured, ForRobot, ByWalker, Parallel, Printed):
     """
 
     usual = frozenset("weights runs traj world engine plant seeds until_clear robot out".split())
-    # nominal, expert, best, weights files, folders of straight.json, c.json, ...; or NAME=one
+    # nominal, expert, shipped, weights files, folders of straight.json, c.json, ...; or NAME=one
     weights: tuple[WeightSets, ...] = BASELINES
     runs: tuple[Run, ...] = ()  # instead: finished runs of `hector tune`, side by side
     traj: Trajectories = ("straight",)  # names (all: straight, c and s) or TOML files
@@ -292,7 +293,7 @@ class Walk(Configured, ForRobot, ByWalker, Printed):
     traj: Trajectory = "straight"  # straight, c, s, sideways, turn, eight, stop-and-go or a file
     world: World = "hfs"  # where to walk
     seed: Seed = 0  # seed of the plant and of the estimator's noise
-    weights: Weights = "nominal"  # nominal, expert, best or a weights file
+    weights: Weights = "nominal"  # nominal, expert, shipped or a weights file
     seconds: Seconds = 4.0  # length of the walk [s]
     out: Path | None = None  # file for the trajectory (.npz)
     video: Path | None = None  # file for a film beside nominal weights (.mp4; .webp for a page)
@@ -320,19 +321,21 @@ class Twin(Check, ByPlanner):
     Example: hector log twin mine.npz --robot mine.toml --traj straight --weights mine.json
     """
 
-    weights: Weights = "nominal"  # with which the log was walked: a file, nominal, expert or best
+    # with which the log was walked: a file, nominal, expert or shipped
+    weights: Weights = "nominal"
 
 
 @_command
 class Foretell(ForRobot, ByPlanner, ByMapping, Printed):
     """Foretell from logs of walks what other weights would bring on the robot that walked.
 
-    Example: hector log foretell mine.npz --walked nominal --weights expert best
+    Example: hector log foretell mine.npz --walked nominal --weights expert shipped
     """
 
     logs: tuple[Annotated[Path, PathKind.BAG], ...]  # of one robot and one trajectory
-    walked: Weights = "nominal"  # with which they were walked: a file, nominal, expert or best
-    weights: tuple[Weights, ...] = ("best",)  # that are foretold
+    # with which they were walked: a file, nominal, expert or shipped
+    walked: Weights = "nominal"
+    weights: tuple[Weights, ...] = ("shipped",)  # that are foretold
     traj: Trajectory = "straight"  # that was walked: a name or a TOML file
     seconds: Seconds = 4.0  # length of the walks [s]
 
@@ -365,7 +368,7 @@ class Export(Printed):
     Example: hector export latest
     """
 
-    run: Annotated[Path, PathKind.EXPORTABLE]  # run folder, `latest`, `best` or a weights file
+    run: Annotated[Path, PathKind.EXPORTABLE]  # run folder, `latest`, `shipped` or a weights file
     set: str = "best"  # weight set of the run
     out: Path | None = None  # folder; by default `export` in the run or beside the weights file
     seconds: Seconds = 1.0  # length of the walk of its check after the start-up [s]
@@ -388,7 +391,7 @@ class View(Flags):
     run: tuple[Run, ...] = field(metadata={"or": "live"})
     live: bool = False  # instead: walk in real time, turn weights, push, tune step by step
     robot: RobotFile = None  # TOML file of the robot of a live walk; HECTOR by default
-    # weights of a live walk, one or two: nominal, expert, best or a weights file
+    # weights of a live walk, one or two: nominal, expert, shipped or a weights file
     weights: tuple[Weights, ...] = ("nominal",)
     # weight sets of the run: before and after; while it is tuned, `with` in place of `best`
     sets: tuple[str, str] = ("nominal", "best")

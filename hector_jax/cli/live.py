@@ -76,6 +76,6 @@ def _named(robot: Robot) -> dict[str, Weights]:
     """Return the named sets that the robot has."""
     found = {}
     for name in NAMED_WEIGHTS:
-        with suppress(InputError):  # a robot may have no best set
+        with suppress(InputError):  # a robot may ship no set
             found[name] = arguments.weights_by_name(name, robot)
     return found

@@ -349,6 +349,8 @@ def _check_source(label: str, value: Path | str, source: PathKind) -> None:
     if not valid:
         of_sets = source in (PathKind.WEIGHTS, PathKind.SETS)
         hint = did_you_mean(text, NAMED_WEIGHTS) if of_sets else ""
+        if of_sets and text == "best":
+            hint = ": the set that ships is `shipped` now, that of a run its weights/best.json"
         raise InputError(f"{label} must be {source.value}, got {one_line(str(value))!r}{hint}")
     if is_file:
         check_file(path, "the file")

@@ -44,8 +44,8 @@ def save_weights(path: Path, weights: Weights, schema: str | None = None) -> Non
     write_json(path, tree | weights_tree(weights))
 
 
-def best(robot: Robot | None = None) -> Weights:
-    """Read the tuned weights shipped with a robot: `ROBOT-best.json` beside its ROBOT.toml.
+def shipped(robot: Robot | None = None) -> Weights:
+    """Read the tuned weights shipped with a robot: `ROBOT-shipped.json` beside its ROBOT.toml.
 
     HECTOR's, which are the default, are tuned for all trajectories on drawn models alone, with the
     limit of the position error and the width of the steps (docs/results.md).
@@ -54,9 +54,9 @@ def best(robot: Robot | None = None) -> Weights:
         InputError: one line, if the robot has no such file or the file is invalid.
     """
     toml = (HECTOR if robot is None else robot.description).path
-    path = toml.with_name(f"{toml.stem}-best.json")
+    path = toml.with_name(f"{toml.stem}-shipped.json")
     if not path.exists():
-        raise InputError(f"weights best: no {path}; tune this robot and name a file of its run")
+        raise InputError(f"weights shipped: no {path}; tune this robot and name a file of its run")
     return load_weights(path, robot)
 
 

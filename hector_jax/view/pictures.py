@@ -1,4 +1,4 @@
-"""The pictures and the film of each command, drawn by `report.plots` and `video`."""
+"""The pictures and the film of each command, drawn by plots and video.py."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -27,6 +27,7 @@ SETS = {
     "without": {"color": ORANGE, "linestyle": (0, (4, 1.2, 1, 1.2))},
     "with": {"color": GREEN, "linestyle": "-"},
     "best": {"color": "#1f2f8f", "linestyle": "-"},
+    "shipped": {"color": "#1f2f8f", "linestyle": (0, (5, 1, 1, 1))},
 }
 """Lines of the package's weight sets; `looks_of` returns a look for any set."""
 
@@ -42,13 +43,14 @@ CURVES = {
 """Lines of references and wrenches."""
 CURVES |= {"raw": CURVES["commanded"], "residual": SETS["with"]}
 
-_MARKER = {"nominal": "v", "expert": "D", "without": "s", "with": "o", "best": "p"}
+_MARKER = {"nominal": "v", "expert": "D", "without": "s", "with": "o", "best": "p", "shipped": "*"}
 _SPARE_STYLE = {"linestyle": (0, (2.5, 1, 1, 1, 1, 1)), "linewidth": 1.1}
 _SPARE = (("#b8447a", "s"), ("#6cb0dc", "^"), ("#8a8a00", "h"), ("black", "P"), ("#c07a3a", "X"))
 _NAMES = {
     "without": "without (tuned, no net)",
     "with": "with (tuned, net)",
     "best": "best (tuned)",
+    "shipped": "shipped (tuned)",
     "predicted": "predicted by the net",
     "linear": "predicted by a linear map",
     "paper": "predicted by the paper's net",
