@@ -14,7 +14,7 @@ from jaxtyping import Float
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import did_you_mean, expect, listed, require
 from hector_jax.importing.draft import Draft
-from hector_jax.importing.elements import File
+from hector_jax.importing.elements import File, check_couplings
 from hector_jax.importing.links import Link, links_of, subtree
 from hector_jax.importing.rebuild import Pieces, rebuild
 from hector_jax.robot.poses import data_at
@@ -55,6 +55,7 @@ def to_standard(file: File, draft: Draft, name: str) -> Standard:
     Raises:
         InputError: one line with the value received, the expected one and the remedy.
     """
+    check_couplings(file, draft.all_joints, draft.joints.weld)
     parts, model = _parts(file, draft), file.model
     legs = len(draft.legs)
     if draft.joints.armature:

@@ -240,7 +240,7 @@ def check_couplings(file: File, joints: Sequence[str], weld: Sequence[str]) -> N
             leg_parts |= parts
         elif own and own <= {*weld}:
             welded |= parts
-    for coupling in (x for tag in _COUPLINGS for x in file.root.findall(f"{tag}/*")):
+    for tag, coupling in ((tag, x) for tag in _COUPLINGS for x in file.root.findall(f"{tag}/*")):
         references = {
             value
             for element in coupling.iter()
@@ -249,7 +249,7 @@ def check_couplings(file: File, joints: Sequence[str], weld: Sequence[str]) -> N
         }
         coupled = sorted(references & leg_parts)
         open_ = references & welded or coupling.get("active") == "false"
-        text = f"<{coupling.tag}> couples {', '.join(coupled)}, expected legs of "
+        text = f"<{coupling.tag}> of <{tag}> couples {', '.join(coupled)}, expected legs of "
         text += "free hinges: remove it, or weld a joint of it (hector robot --weld NAME)"
         expect(file.path, not coupled or open_, text)
 

@@ -43,7 +43,7 @@ from hector_jax.core.settings import as_toml, from_table, read_toml
 from hector_jax.core.trajectory import FEET
 from hector_jax.importing.convert import Standard, guessed_numbers, short, to_standard
 from hector_jax.importing.draft import PublishedJoints, draft_of
-from hector_jax.importing.elements import check_couplings, read_file
+from hector_jax.importing.elements import read_file
 from hector_jax.importing.meshes import resolved
 from hector_jax.importing.soles import Sole, find_soles
 from hector_jax.importing.stand import standing_pose
@@ -131,7 +131,6 @@ def _stages(
                 yield (found := _with_legs(survey_file(file, named, (*weld, *_welded(own))), found))
                 yield (found := _with_feet(found, wrong))
             draft = draft_of(toml, found.table)
-            check_couplings(file, draft.all_joints, draft.joints.weld)
             joints, lines = guessed_numbers(file, draft)
             table = _merged({"joints": joints}, found.table)
             yield (found := found._replace(table=table, guesses=(*found.guesses, *lines)))

@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import expect, require
-from hector_jax.importing.elements import File
+from hector_jax.importing.elements import File, check_couplings
 from hector_jax.importing.links import subtree
 from hector_jax.robot.description import FEWEST_JOINTS, MOST_JOINTS
 from hector_jax.robot.poses import data_at
@@ -77,6 +77,7 @@ def survey_file(
         require(path, "joint", joint, names)
     legs = tuple(tuple(names.index(joint) for joint in leg) for leg in named)
     legs = legs or _legs(path, data, [*free, *(names.index(joint) for joint in welded)])
+    check_couplings(file, [names[j] for j in sum(legs, ())], welded)
     trunk = int(model.jnt_bodyid[free[0]] if free else model.body_rootid[_body(model, legs[0][0])])
     others = [j for j in range(model.njnt) if j not in sum(legs, (*free,))]
     knee = _knee(path, data, legs[0])
