@@ -240,7 +240,7 @@ def check_couplings(file: File, joints: Sequence[str], weld: Sequence[str]) -> N
             leg_parts |= parts
         elif own and own <= {*weld}:
             welded |= parts
-    for tag, coupling in ((tag, x) for tag in _COUPLINGS for x in file.root.findall(f"{tag}/*")):
+    for tag, coupling in ((of, x) for of in _COUPLINGS for x in file.root.findall(f"{of}/*")):
         references = {
             value
             for element in coupling.iter()
