@@ -631,6 +631,15 @@ def other_pages():
     held = sum(low <= came <= high for (_, low, high), came in ends)
     text = "{refused} of {logs} logs were refused; of the".format(**cases["refused"]["shifted"])
     yield DOCS / "howto" / "walks.md", f"{text} {len(shifted)} forecasts by the others {held} held"
+    even = [pair for pair in cases["pairs"] if pair["world"] == "standin-even"]
+    for here, text in ((True, "it was {} of {}, and {held} of {of}"), (False, "{held} of {of} f")):
+        found = [x for x in even if ((x["robot"], x["engine"]) == ("hector", "c")) == here]
+        group = foretell.calibrated(foretell.HERE if here else foretell.ELSEWHERE)["L"]
+        ends = [(foretell.interval(x["foretold"]["L"], group), x["walked"]["L"]) for x in found]
+        held = sum(low <= came <= high for (_, low, high), came in ends)
+        logs = cases["refused"]["even"]
+        text = text.format(logs["refused"], logs["logs"], held=held, of=len(found))
+        yield DOCS / "howto" / "walks.md", text
     off = [x["walked"]["L"] - x["foretold"]["L"] for x in cases["pairs"] if x["robot"] == "own"]
     close = sum(abs(x) < 0.12 for x in off)
     text = (
