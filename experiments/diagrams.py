@@ -238,7 +238,7 @@ def draw_time(path: Path) -> None:
     start, stand = -first_tick(config) * tick, config.gait.stand * tick
     with _canvas(path, 0.4, 6.6) as axes:
         axes.text(0.1, 6.3, "calls", weight="bold", fontsize=11)
-        words = f"One in each millisecond. Of {period} the first makes a plan; all make torques."
+        words = f"One in each millisecond. The first of {period} makes a plan; each makes torques."
         axes.text(1.2, 6.3, words, fontsize=9.5)
         for ms in range(2 * period + 1):
             x, plans = 0.6 + 0.54 * ms, ms % period == 0
@@ -334,7 +334,7 @@ def _draw_above(axes: Axes, point: tuple[float, float], toe: float, heel: float)
     _arrow(axes, point, (x + 1.9, y), text="x, world", at=(x + 1.9, y - 0.25))
     _arrow(axes, point, (x, y + 1.5), text="y, world", at=(x + 0.1, y + 1.7))
     for tip, name in ((point + 2.0 * along, "x"), (point + 1.3 * across, "y")):
-        at = tip + 0.35 * across
+        at = tip + 0.4 * across - 0.25 * along
         _arrow(axes, point, tuple(tip), text=f"{name}, foot", at=at, color=BLUE, linewidth=2.2)
     axes.plot(x, y, "o", color=BLUE, markersize=8)
     axes.text(x + 1.5, y + 0.35, "yaw", **CENTRE, **SMALL)
