@@ -25,9 +25,9 @@ from hector_jax.control.controller import WalkConfig
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory
-from hector_jax.robot.links import rotation_of
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
+from hector_jax.robot.poses import rotation_of
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant

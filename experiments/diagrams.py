@@ -26,7 +26,7 @@ CHOICES = (  # what somebody has, and the commands to type
     (
         "a robot",
         "its MJCF or URDF",
-        ("hector robot h1.xml --out h1.toml", "hector tune --robot h1.toml"),
+        ("hector robot h1.xml --out h1", "hector tune --robot h1/robot.toml"),
     ),
     (
         "a controller",

@@ -146,7 +146,7 @@ int test_few_changes(void) { /* a plan that is cut short has a wrench within its
 int test_two_threads(void) { /* plan and hold as two calls do what step does, also a late plan */
     struct controller_memory memory = { 0 };
     struct controller_targets targets = { 0 };
-    struct controller_output other;
+    struct controller_output other, one_more;
     static struct controller one, two;
     struct controller_estimate e = standing();
     controller_init(&one), controller_init(&two);
@@ -164,6 +164,10 @@ int test_two_threads(void) { /* plan and hold as two calls do what step does, al
     for (int64_t ms = 500; ms < 490 + CONTROLLER_MAX_AGE; ++ms)
         CHECK(controller_hold(&memory, ms, &targets, &e, &other) == CONTROLLER_SOLVED);
     CHECK(other.age == CONTROLLER_MAX_AGE - 1);
+    two.targets.force[0][2] = two.targets.force[1][2] = 1.7e308; /* no plan of ours */
+    two.targets.tunables.gravity_compensation = 1.7e308;
+    CHECK(controller_hold(&memory, 489 + CONTROLLER_MAX_AGE, &two.targets, &e, &one_more) == CONTROLLER_BAD_INPUT);
+    CHECK(memcmp(one_more.torque, other.torque, sizeof other.torque) == 0);
     CHECK(controller_hold(&memory, 492 + CONTROLLER_MAX_AGE, &targets, &e, &other) == CONTROLLER_UNSAFE);
     return 0;
 }

@@ -89,6 +89,7 @@ static void retune(void) {
 static void inspect(const Targets *plan) {
     static Qp rows;
     ++by_plan[plan->status];
+    RULE(plan->status != CONTROLLER_INFEASIBLE && plan->status != CONTROLLER_UNBOUNDED);
     RULE(within(c.missing, 6, 10.0 * controller_upper.integral_limit) && c.lost >= 0.0 && c.lost <= 1.0);
     FOR(f, FEET) {
         double wrench[6], Rz[3][3], mu = (1.0 - c.lost) * plan->tunables.friction;

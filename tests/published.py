@@ -2,13 +2,21 @@
 
 import re
 import struct
+from itertools import count
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull
 
-from hector_jax.robot.description import Description, Foot
+from hector_jax.core.settings import as_toml
+from hector_jax.importing.convert import to_standard
+from hector_jax.importing.draft import draft_of
+from hector_jax.importing.elements import read_file
+from hector_jax.importing.propose import files_of, propose_robot
 
 
 def replaced(text, *changes):
@@ -80,18 +88,58 @@ TEXTS = {"free": "<freejoint/>", "more": "", "arm": "", "shin": SHIN, "motors": 
 TEXTS |= {"knee": 'range="-0.1 2"', "thigh": 'pos="0.01 0 -0.02"'}
 
 
+class Given(NamedTuple):
+    """A model, and the table of a TOML that names its parts."""
+
+    model: object
+    table: dict
+
+    def write(self):
+        """The path of the TOML, written beside the model."""
+        path = self.model.with_name("given.toml")
+        path.write_text(as_toml({"model": self.model.name, **self.table}, []))
+        return path
+
+
+_FOLDER, _NUMBERS = TemporaryDirectory(), count()
+
+
+def proposed(path):
+    """What is found of a robot, converted into a folder that stays until the tests end."""
+    return propose_robot(path, Path(_FOLDER.name) / str(next(_NUMBERS)))
+
+
+def standard(given):
+    """A robot in the standard form."""
+    return to_standard(read_file(given.model), draft_of(given.model, given.table), "given")
+
+
+def converted(path, out):
+    """The TOML of a robot that was converted into a folder, as by `hector robot --out`."""
+    proposal = propose_robot(path, out)
+    assert proposal.error is None, proposal.error
+    for name, content in files_of(proposal, path, []).items():
+        (out / name).write_bytes(content)
+    return out / "robot.toml"
+
+
 def small(folder, ankle=-0.3, contacts=CONTACTS, **changes):
-    """The small biped, of which some texts may be others, and its description."""
+    """The small biped, of which some texts may be others."""
     texts = {name: changes.pop(name, text) for name, text in TEXTS.items()}
     legs = {s: LEG.format(s=s, y=y, **texts) for s, y in zip(SIDES, (0.1, -0.1), strict=True)}
     path = folder / "robot.xml"
     path.write_text(BIPED.format(**texts, **legs))
     angles = {f"{s}_{j}": a for s in SIDES for j, a in ANGLES.items()}
     angles |= {"waist": 0.4, "shoulder": 1.0, "left_ankle": ankle, "right_ankle": ankle}
-    fields = {"model": path, "joints": tuple(JOINTS), "linkage": None}
-    fields |= {"weld": ("waist", "shoulder"), "standing": tuple(angles.items())}
-    fields["feet"] = tuple(Foot(None, contacts, f"{s}_foot") for s in SIDES)
-    return Description(**fields | changes)
+    joints = changes.pop("joints", JOINTS)
+    named = {"left": joints[:4], "right": joints[4:]} | {"weld": ["waist", "shoulder"]}
+    named |= {"weld": list(changes.pop("weld"))} if "weld" in changes else {}
+    bodies = changes.pop("feet", [f"{s}_foot" for s in SIDES])
+    feet = {
+        s: {"body": body, "contacts": [list(x) for x in contacts]}
+        for s, body in zip(SIDES, bodies, strict=True)
+    }
+    return Given(path, {"standing": angles, "joints": named, "feet": feet, **changes})
 
 
 def write_box(path, half):
@@ -127,7 +175,7 @@ LINK = '<link name="payload"><inertial><mass value="5"/></inertial></link>'
 HOLD = '<joint name="{}" type="fixed"><parent link="{}"/><child link="{}"/></joint>'
 
 
-def urdf_of(model, world=False, effort=True):
+def urdf_of(model, world=False):
     """The bodies of a compiled model as a URDF."""
     text = ['<robot name="r">']
     if world:
@@ -152,18 +200,20 @@ def urdf_of(model, world=False, effort=True):
             f'<child link="{body.name}"/>{place(body.pos, body.quat)}'
             f'<axis xyz="{joint.axis[0]} {joint.axis[1]} {joint.axis[2]}"/>'
             f'<limit lower="{joint.range[0]}" upper="{joint.range[1]}" velocity="9" '
-            f'effort="{limit if effort else 0}"/>'
+            f'effort="{limit}"/>'
             f'<dynamics damping="{model.dof_damping[dof]}" friction="0"/></joint>'
         )
     return "\n".join([*text, "<gazebo><plugin/></gazebo></robot>"])
 
 
 def by_numbers(folder, text):
-    """HECTOR's description, feet by places and standing by angles, of another file."""
+    """Another file with HECTOR's joints, feet by places and standing by angles."""
     path = folder / "robot.urdf"
     path.write_text(text)
     bend = {"hip_pitch": np.pi / 4, "knee": -np.pi / 2, "ankle": np.pi / 4}
-    angles = {f"{s}_{j}": float(a) for s in ("left", "right") for j, a in bend.items()}
-    point, sole = (0.0, 0.0, -0.04), ((0.09, 0.0, -0.04), (-0.06, 0.0, -0.04))
-    feet = tuple(Foot(point, sole, f"{side}_foot") for side in SIDES)
-    return Description(model=path, standing=tuple(angles.items()), feet=feet)
+    angles = {f"{s}_{j}": float(a) for s in SIDES for j, a in bend.items()}
+    names = "hip_yaw hip_roll hip_pitch knee ankle".split()
+    joints = {s: [f"{s}_{x}" for x in names] for s in SIDES}
+    point, sole = [0.0, 0.0, -0.04], [[0.09, 0.0, -0.04], [-0.06, 0.0, -0.04]]
+    feet = {s: {"body": f"{s}_foot", "contacts": sole, "point": point} for s in SIDES}
+    return Given(path, {"standing": angles, "joints": joints, "feet": feet})

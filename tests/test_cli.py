@@ -118,7 +118,7 @@ REFUSED = [  # the whole of what is said, or a part of it
     ("view", "RUN expects a value, got none; or --live"),
     ("walk --seconds long", "Error parsing --seconds: expected a number, got 'long'"),
     ("walk --world moon", "invalid choice 'moon' for argument '--world'. Expected one of ('"),
-    ("walk --robot assets/hector.xml", "hector robot MODEL --out NAME.toml makes one, got"),
+    ("walk --robot assets/hector.xml", "hector robot MODEL --out FOLDER makes one, got"),
     (f"walk --weights {300 * 'x'}.json", "cannot read the file: File name too long"),
     (f"tune --resume {300 * 'x'}", "--resume must be the folder of a run of `hector tune`"),
     ("walk --world srbm --engine mjx", "--engine mjx needs a world with a plant"),

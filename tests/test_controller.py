@@ -64,7 +64,7 @@ def test_measured_feet_are_those_of_mujoco_and_their_yaw_is_as_continuous_as_the
     position = data.qpos[:3] + R @ ROBOT.com_offset
     state = State(*(jnp.array(row, float) for row in (euler, position, (0, 0, 0), (0, 0, 0))))
     feet = feet_of(Measurement(state, jnp.asarray(joints), jnp.zeros(10)))
-    for foot, point in enumerate(ROBOT.description.named_feet):
+    for foot, point in enumerate(ROBOT.description.feet):
         site = data.site(point.point)
         np.testing.assert_allclose(feet.position[foot], site.xpos, atol=1e-9)
         heading = [np.cos(feet.yaw[foot]), np.sin(feet.yaw[foot])]

@@ -90,10 +90,10 @@ PLANTED = [
 ]
 
 
-def planted(folder, log, *, R=1.0, mass=1.0, height=1.0):
+def planted(folder, log, *, R=1.0, mass=1.0, height=1.0, file=TWIN):
     """Fields of [twin] that are found, and the mean error with them."""
     np.savez(folder / "log.npz", **log)
-    robot, weights = load_robot(TWIN), expert()
+    robot, weights = load_robot(file), expert()
     body = robot._replace(mass=mass * robot.mass, standing_height=height * robot.standing_height)
     config = walk_config(robot)
 
@@ -120,6 +120,17 @@ def test_a_planted_convention_is_found(tmp_path, walked, changes, model, told):
     for name, value in told.items():
         expected = pytest.approx(value, rel=1e-3) if isinstance(value, float) else value
         assert found[name] == expected, name
+
+
+def test_a_convention_is_found_for_a_twin_with_another_centre_of_mass(tmp_path, walked):
+    robot, file = load_robot(TWIN), tmp_path / "com.toml"
+    own, height = robot.com_offset.tolist(), float(robot.standing_height)
+    (tmp_path / "hector.xml").write_bytes(TWIN.with_name("hector.xml").read_bytes())
+    file.write_text(f"{TWIN.read_text()}com = {own}\nheight = {height}\n")
+    for log, told in ((walked, {}), (walked | on_ground(walked), {"wrenches": "on_ground"})):
+        found, error = planted(tmp_path, log, file=file)
+        assert found == told
+        assert error < 0.01
 
 
 def test_in_a_sound_log_no_convention_is_named(tmp_path, walked):

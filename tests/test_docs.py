@@ -566,6 +566,39 @@ def run():
     assert {*weights.Q.ang_velocity, *weights.Q.velocity} == {1.0}
 
 
+def laboratory():
+    """The laboratory's controller, tuned three times by calls and three times by its twin."""
+    of = report("own_controller.json")["laboratory"]
+    hows = of["by calls"], of["by twin"]
+    sets = [*hows[0], *hows[1]]
+    commands = [
+        x for each in (*sets, {"commands": of["shipped"]}) for x in each["commands"].values()
+    ]
+    assert not any(x["falls"] for x in commands)
+    assert all(each["L [%]"]["high"] < -10 and each["walks"] <= 60 for each in sets)
+
+    def ends(values):
+        return min(values), max(values)
+
+    gains = [ends([-each["L [%]"]["mean"] for each in how]) for how in (sets, *hows)]
+    walks = ends([each["walks"] for each in sets])
+    text = "after {} to {} walks L was {:.0f} to {:.0f} % lower on 64 other plants; none"
+    yield DOCS / "howto" / "own.md", text.format(*walks, *gains[0])
+    notes = ROOT / "experiments" / "notes.md"
+    text = "L falls by {:.0f} to {:.0f} % by calls and by {:.0f} to {:.0f} % by the twin"
+    yield notes, text.format(*gains[1], *gains[2])
+    least = min(-x["L [%]"]["mean"] for each in sets for x in each["commands"].values())
+    yield notes, f"on no command by less than {least:.0f} %"
+    for command, page in (
+        ("straight", notes),
+        ("turn", notes),
+        ("turn", DOCS / "howto" / "own.md"),
+    ):
+        plane = ends([each["commands"][command]["plane [cm]"] for each in sets])
+        before = of["shipped"][command]["plane [cm]"]
+        yield page, "from {} to {:.0f} or {:.0f}".format(before, *plane)
+
+
 def other_pages():
     """Figures of paper, notes, late motors, and of the delay that a robot bears."""
     losses = report("paper.json")["losses"]
@@ -655,7 +688,7 @@ def other_pages():
 def test_each_number_of_readme_results_and_limits_is_that_of_its_file():
     functions = (tracking, losses, changes_of_the_command, disturbances, race, robots)
     told = [(RESULTS, "95 %"), (LIMITS, "Python 3.11 to 3.13"), (LIMITS, "64 bits")]
-    for function in (*functions, published_robots, engines, run, other_pages):
+    for function in (*functions, published_robots, engines, run, laboratory, other_pages):
         told += function()
     left = {}
     for page, words in told:

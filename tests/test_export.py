@@ -36,7 +36,7 @@ from hector_jax.control.contact import (
 )
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
-from hector_jax.control.parameters import TUNABLES
+from hector_jax.control.parameters import TUNABLES, Q, R
 from hector_jax.control.reference import Command, named_command
 from hector_jax.control.weights import nominal
 from hector_jax.control.weights_file import load_weights, save_weights
@@ -419,6 +419,17 @@ def test_weights_out_of_bounds_are_refused_and_change_nothing(library, walked, v
     np.testing.assert_array_equal(answers(library, inputs, change), answers(library, inputs))
 
 
+def test_other_weights_are_bounded_by_the_boxes_of_the_tuner(library):
+    functions, parameters = ctypes.CDLL(str(library)), CONFIG.parameters(TUNED)
+    boxes = [*[Q] * 12, *[R] * 12]
+    for tunable in TUNABLES.values():
+        boxes += [tunable] * np.size(tunable.read(parameters))
+    exported = list(exported_numbers(functions))
+    for end, further in (("lower", np.minimum), ("upper", np.maximum)):
+        found = (ctypes.c_double * len(boxes)).in_dll(functions, f"controller_{end}")
+        assert list(found) == further([getattr(box, end) for box in boxes], exported).tolist()
+
+
 @pytest.fixture(scope="module")
 def solve_in_c(library):
     """The C program's solution of a QP of one contact a step: x, its residual and status."""
@@ -497,18 +508,29 @@ def test_the_library_allocates_nothing(library):
     assert "sincos" in listed or "sin" in listed
 
 
+SANITIZERS = "-O1 -g -fsanitize=address,undefined -fno-sanitize-recover"
+BUILDS = [("cc", SANITIZERS, []), ("aarch64-linux-gnu-gcc", "-O2 -static", ["qemu-aarch64"])]
+
+
 @pytest.mark.slow
-def test_address_and_undefined_behaviour_are_clean_along_the_walk(walked, tmp_path):
-    inputs = inputs_of(walked, ROBOT)
+@pytest.mark.parametrize("build", BUILDS, ids=["sanitizers", "aarch64"])
+def test_another_build_walks_as_the_first_does(walked, tmp_path, build):
+    for program in (build[0], *build[2]):
+        if shutil.which(program) is None:
+            pytest.skip(f"there is no {program}")
+    inputs, sums = inputs_of(walked, ROBOT), []
     inputs.estimate["euler"][700, 1], inputs.estimate["velocity"][800] = np.nan, 1e150
     compile_controller(source_of(TUNED), tmp_path)
-    for name, part in inputs._asdict().items():
-        part.tofile(tmp_path / name)
-    flags = "-std=c99 -O1 -g -fsanitize=address,undefined -fno-sanitize-recover -I. -o walk"
-    words = ["cc", HERE / "exported_walk.c", "controller.c", *flags.split(), "-lm"]
-    subprocess.run(words, cwd=tmp_path, check=True)
-    run = subprocess.run(["./walk", *inputs._fields], cwd=tmp_path, capture_output=True, text=True)
-    assert (run.returncode, run.stderr, np.isfinite(float(run.stdout))) == (0, "", True)
+    for file, part in inputs._asdict().items():
+        part.tofile(tmp_path / file)
+    for compiler, flags, runner in (("cc", "-O2", []), build):
+        words = [compiler, "-std=c99", *flags.split(), HERE / "exported_walk.c", "controller.c"]
+        subprocess.run([*words, "-I.", "-lm", "-o", "walk"], cwd=tmp_path, check=True)
+        words = [*runner, "./walk", *inputs._fields]
+        ran = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+        assert (ran.returncode, ran.stderr) == (0, "")
+        sums.append(float(ran.stdout))
+    assert sums[1] == pytest.approx(sums[0], abs=1e-8)
 
 
 def test_weights_that_fall_and_constraints_of_ones_own_are_refused():
@@ -606,9 +628,12 @@ def test_a_run_is_exported_with_its_own_controller(run):
     assert Run(run).controller == own
 
 
-def test_a_set_that_is_not_there_is_one_line_and_writes_nothing(monkeypatch, capsys, run):
-    line = refused(monkeypatch, capsys, "export", run, "--set", "bset")
-    assert "did you mean 'best'" in line
+@pytest.mark.parametrize(
+    ("flag", "word", "told"),
+    [("--set", "bset", "did you mean 'best'"), ("--prefix", "1st", "must be a name in C")],
+)
+def test_what_is_refused_is_one_line_and_writes_nothing(monkeypatch, capsys, run, flag, word, told):
+    assert told in refused(monkeypatch, capsys, "export", run, flag, word)
     assert not (run / "export").exists()
 
 

@@ -1,7 +1,6 @@
 """Other robots: their models, flat feet, gradients, both engines, export, tuning."""
 
 import json
-from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -24,7 +23,6 @@ from hector_jax.export.check import compare_with_live, compile_controller, compi
 from hector_jax.export.source import controller_source
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.importing.remarks import differences
-from hector_jax.robot.description import Description
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.store import nets
 from hector_jax.store.collection import load_walks
@@ -195,7 +193,6 @@ def strider():
 
 def test_the_description_of_hector_says_what_the_code_takes_by_default():
     robot = load_robot()
-    assert replace(robot.description, control=(), nominal=None, expert=None) == Description()
     assert walk_config(robot) == WalkConfig()
     assert repr(walk_config(robot)) == repr(WalkConfig())  # by which walks are known
     for of_robot, default in ((nominal(robot), nominal()), (expert(robot), expert())):

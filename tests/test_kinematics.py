@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 from model import EXAMPLES
+from published import converted
 from scipy.spatial.transform import Rotation
 
 from hector_jax.core.geometry import rot_x, rot_y, rot_z
@@ -95,7 +96,8 @@ def made(request, tmp_path_factory):
     if request.param == "hector":
         path = None
     elif request.param in LEGS:
-        path = written(tmp_path_factory.mktemp("made"), request.param)
+        folder = tmp_path_factory.mktemp("made")
+        path = converted(written(folder, request.param), folder / "robot")
     return load_robot(path), compile_model(describe(path))
 
 
@@ -121,7 +123,7 @@ def random_joints(robot, spread=0.4):
 def test_feet_jacobians_and_the_weight_of_the_legs_under_a_tilted_trunk_are_those_of_mujoco(made):
     robot, model = made
     standing = posed(robot, model, robot.standing_joints)
-    names = [foot.point for foot in robot.description.named_feet]
+    names = [foot.point for foot in robot.description.feet]
     bodies = [model.site(name).bodyid[0] for name in names]
     soles = [standing.xmat[b].reshape(3, 3).T for b in bodies]  # level when it stands
     for joints in random_joints(robot):

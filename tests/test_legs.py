@@ -13,9 +13,9 @@ from hector_jax.control import LegConfig, Measurement, legs
 from hector_jax.control.footstep import Feet
 from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.trajectory import State, Wrench
-from hector_jax.robot.checks import standing_data
 from hector_jax.robot.kinematics import foot_poses, leg_gravity
 from hector_jax.robot.model import compile_model
+from hector_jax.robot.poses import standing_data
 
 CONFIG = LegConfig()
 SWING = 0.2
@@ -80,7 +80,7 @@ def statics(robot, share):
     """
     model = compile_model(robot.description)
     data = standing_data(robot.description, model)
-    sites = [data.site(foot.point) for foot in robot.description.named_feet]
+    sites = [data.site(foot.point) for foot in robot.description.feet]
     arms = np.array([site.xpos for site in sites]) - data.subtree_com[1]
     if share is None:
         A = np.stack([np.ones(4), arms[:, 0], arms[:, 1]])

@@ -69,8 +69,10 @@ def test_a_part_whose_height_over_the_floor_is_unknown_here_is_refused_by_name(t
     path = tmp_path / "hector.xml"
     round_trunk = MODEL_PATH.read_text().replace('"trunk" type="box"', '"trunk" type="cylinder"')
     path.write_text(round_trunk)
+    toml = tmp_path / "hector.toml"
+    toml.write_text('model = "hector.xml"')
     with pytest.raises(ValueError, match="geom trunk .* is a CYLINDER; .* BOX or CAPSULE"):
-        walk_batch(CONFIG, load_robot(path), [job(expert())])
+        walk_batch(CONFIG, load_robot(toml), [job(expert())])
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 from model import EXAMPLES
 
 from hector_jax import Job, load_robot, named_command, nominal, walk, walk_config
-from hector_jax.robot.description import Description
+from hector_jax.robot.description import HECTOR
 from hector_jax.sim import programs
 from hector_jax.sim.programs import ROBOTS, by_robot, make_room
 from hector_jax.sim.world import ideal
@@ -33,7 +33,7 @@ def test_the_programs_of_one_robot_too_many_free_those_of_the_others(monkeypatch
     monkeypatch.setattr(programs, "_present", {})  # other tests have walked with robots
     counts = []
     for i in range(4 * ROBOTS):
-        description = replace(Description(), name="r" * (i + 1))
+        description = replace(HECTOR, name="r" * (i + 1))
         make_room(description)
         make_room(description)
         for compiled in (program(description), lambda x, d=description: shared(d, x)):

@@ -13,9 +13,9 @@ from hector_jax.control import MpcConfig, nominal, walk_config
 from hector_jax.core.inputs import InputError
 from hector_jax.importing.remarks import differences
 from hector_jax.robot import response as answers
-from hector_jax.robot.checks import standing_data
-from hector_jax.robot.description import Description
+from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import compile_model, describe
+from hector_jax.robot.poses import standing_data
 from hector_jax.robot.response import DELAY, LAG, PHASE_MARGIN, response
 from hector_jax.sim.margin import Loops, delay_lines, modes
 
@@ -29,9 +29,9 @@ def body_pairs(model, data):
 
 def test_the_standing_robot_is_that_of_the_facts_sheet_and_its_own_mirror_image():
     """MuJoCo's H, moved from the trunk's origin to the CoM; armature sits on joints only."""
-    data = standing_data(Description(), MODEL)
+    data = standing_data(HECTOR, MODEL)
     assert ROBOT.trunk_height == pytest.approx(0.548, abs=1e-3)
-    for foot, side in zip([foot.point for foot in Description().named_feet], (1, -1), strict=True):
+    for foot, side in zip([foot.point for foot in HECTOR.feet], (1, -1), strict=True):
         there = [-0.0135, side * 0.0942, 0.0]
         np.testing.assert_allclose(data.site(foot).xpos, there, rtol=0, atol=1e-6)
     np.testing.assert_allclose(np.rad2deg(ROBOT.standing_joints), [0, 0, 45, -90, 45] * 2)
@@ -64,7 +64,7 @@ def test_robot_in_the_air_touches_only_leg_against_leg():
 
 @pytest.mark.parametrize(("turn", "height"), [((0.7, 0.7, 0, 0), 0.08), ((0.7, 0, 0.7, 0), 0.05)])
 def test_lying_robot_touches_the_floor_with_more_than_its_feet(turn, height):
-    data = standing_data(Description(), MODEL)
+    data = standing_data(HECTOR, MODEL)
     data.qpos[2:7] = [height, *turn]
     mujoco.mj_forward(MODEL, data)
     touching = {body for pair in body_pairs(MODEL, data) for body in pair}

@@ -15,7 +15,7 @@ from test_walk import stand
 from hector_jax import hfs, ideal
 from hector_jax.core.settings import from_table, to_table
 from hector_jax.grfm.jobs import draw_jobs
-from hector_jax.robot.description import Description, PlantSizes, read_description
+from hector_jax.robot.description import HECTOR, Description, PlantSizes, read_description
 from hector_jax.robot.model import load_robot, quiet_mujoco
 from hector_jax.sim import world as worlds
 from hector_jax.sim.actuators import init_actuators, step_actuators
@@ -184,7 +184,7 @@ def test_a_blown_up_state_stays_blown_up_and_leaves_no_log(tmp_path, monkeypatch
 
 
 SIZES = PlantSizes(joint_friction=3.0, joint_damping=2.0, push=5.0, trunk_com=1.5, payload=4.0)
-LARGE = Description(plants=SIZES)
+LARGE = replace(HECTOR, plants=SIZES)
 
 
 def described(folder, text):
@@ -206,7 +206,7 @@ def factories(description):
 
 
 def test_plants_and_pushes_of_the_data_have_the_sizes_of_the_robot():
-    for ours, theirs in zip(factories(LARGE), factories(Description()), strict=True):
+    for ours, theirs in zip(factories(LARGE), factories(HECTOR), strict=True):
         np.testing.assert_allclose(ours.joint_friction, 3.0 * theirs.joint_friction)
         np.testing.assert_allclose(ours.joint_damping, 2.0 * theirs.joint_damping)
         np.testing.assert_allclose(ours.trunk_com, 1.5 * theirs.trunk_com)
@@ -227,7 +227,7 @@ def test_sizes_and_loss_are_sections_of_the_robots_file(tmp_path):
     description = read_description(path)
     assert description.plants == PlantSizes(push=4.0, joint_friction=2.5)
     assert description.loss == (("L_ctrl", 0.05),)
-    assert hash(description) != hash(Description())  # static under jit
+    assert hash(description) != hash(HECTOR)  # static under jit
     assert from_table("here", Description, to_table(description)) == description  # as in a dump
     plain = read_description(described(tmp_path, ""))
     assert (plain.plants, plain.loss) == (PlantSizes(), ())

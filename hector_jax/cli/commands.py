@@ -1,9 +1,10 @@
 """The function of each command of `hector`; its flags are in flags.py."""
 
-from collections.abc import Mapping, Sequence
-from contextlib import nullcontext, suppress
+from collections.abc import Mapping
+from contextlib import nullcontext
 from functools import partial, singledispatch
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from hector_jax.cli import (
@@ -32,9 +33,9 @@ from hector_jax.core.settings import as_toml
 from hector_jax.export import export
 from hector_jax.export.template import fill_template
 from hector_jax.grfm.training import TrainConfig
-from hector_jax.importing.propose import RobotProposal, propose_robot, standard_form
+from hector_jax.importing.propose import TOML, RobotProposal, files_of, propose_robot
 from hector_jax.importing.remarks import differences, remarks
-from hector_jax.importing.table import changes_of_model, section, table_of
+from hector_jax.importing.table import section, table_of
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.sim import margin
 from hector_jax.store import nets
@@ -103,30 +104,13 @@ def run_robot(args: flags.Robot) -> None:
         InputError: one line says what must be corrected in the proposal.
     """
     file, out = args.file, args.out
-    if out is not None:
-        if out.suffix != ".toml":
-            raise InputError(f"--out must end in .toml, got {str(out)!r}")
-        if out.exists():
-            raise InputError(f"--out must be a new file, and {out} exists")
-    proposal = propose_robot(file, args.weld)
-    robot, lines, told, wrong = proposal.robot, [], list(proposal.guesses), list(proposal.wrong)
-    if file.suffix == ".toml":
-        with suppress(InputError):  # it does not say enough to walk: what the rules make of it
-            robot = load_robot(file)
-    if robot is not None:
-        lines, told = table_of(robot), [*told, *remarks(robot)]
-        if proposal.error is None:
-            try:
-                loss_of_robot(robot.description)
-                config = walk_config(robot)
-                if config.twin == TwinConfig():  # else its legs are another program's
-                    delay = margin.delay_lines(robot, config, nominal(robot))
-                    lines += section("delay", delay)
-            except InputError as error:  # a setting that controller or loss refuse
-                wrong.append(str(error))
-        files = [x for x in proposal.soles[:1] if x.files]
-        measured = [f"soles measured on {', '.join(x.files)}" for x in files]
-        lines += section("fixed", [*measured, *changes_of_model(robot)])
+    if out is not None and (out.exists() or out.suffix in (".toml", ".xml")):
+        raise InputError(
+            f"--out must be a new folder, which gets robot.toml and robot.xml, got {out}"
+        )
+    with TemporaryDirectory() as folder:
+        proposal = propose_robot(file, Path(folder), args.weld)
+        lines, told, wrong = _looked_at(proposal)
     if file.suffix == ".toml" and proposal.filled:
         lines += section("left out", [f"{', '.join(proposal.filled)}: HECTOR's, by the rules"])
     print("\n".join([*lines, *section("wrong", [*told, *wrong])]))
@@ -134,32 +118,35 @@ def run_robot(args: flags.Robot) -> None:
     comments = [head, *(f"To be fixed: {line}" for line in [*told, *wrong] if wrong)]
     comments += [f"A guess: {line}" for line in proposal.guesses if not wrong]
     if out is not None:
-        _write_robot(out, proposal, comments, file)
+        for name, content in files_of(proposal, file, comments).items():
+            write_file(out / name, content)
         next_step = "fix it, then: hector robot" if wrong else "walk with it: hector walk --robot"
-        say(f"the proposal is in {out}; {next_step} {out}")
+        say(f"the proposal is in {out}; {next_step} {out / TOML}")
     elif proposal.filled:
         print(f"\n{as_toml(proposal.table, comments)}", end="")
     if wrong:
-        # why a robot of unlike legs does not stand
-        unlike = differences(robot)[:1] if robot is not None and proposal.error else []
-        raise InputError("; ".join([*unlike, wrong[-1]]))
+        raise InputError(wrong[-1])
 
 
-def _write_robot(out: Path, proposal: RobotProposal, comments: Sequence[str], file: Path) -> None:
-    """Write a robot in the standard form, or a draft beside a copy of the model that it names."""
-    table, name = proposal.table, str(proposal.table["model"])
-    source, model = file.parent / name, out.parent / name
-    if proposal.wrong:
-        content = source.read_bytes() if source.is_file() else None
-    else:
-        model = out.with_name(f"{out.stem}-standard.xml")
-        table, text = standard_form(proposal, model.name)
-        content = text.encode()
-    if model.exists() and (content is None or model.read_bytes() != content):
-        raise InputError(f"--out writes {model}, which must be a new file, and it exists")
-    if content is not None and not model.exists():
-        write_file(model, content)
-    write_file(out, as_toml(table, comments).encode())
+def _looked_at(proposal: RobotProposal) -> tuple[list[str], list[str], list[str]]:
+    """Return the lines about a robot: its table, remarks on it, and what is wrong with it."""
+    robot, standard, wrong = proposal.robot, proposal.standard, list(proposal.wrong)
+    if robot is None:
+        return [], list(proposal.guesses), wrong
+    lines = table_of(robot, proposal.table["joints"].get("weld", ()))
+    if proposal.error is None:
+        try:
+            loss_of_robot(robot.description)
+            config = walk_config(robot)
+            if config.twin == TwinConfig():  # else its legs are another program's
+                lines += section("delay", margin.delay_lines(robot, config, nominal(robot)))
+        except InputError as error:  # a setting that controller or loss refuse
+            wrong.append(str(error))
+    elif unlike := differences(robot)[:1]:  # why a robot of unlike legs does not stand
+        wrong.append("; ".join([*unlike, wrong.pop()]))
+    measured = [f"soles measured on {', '.join(x.files)}" for x in proposal.soles[:1] if x.files]
+    lines += section("fixed", [*measured, *(standard.notes if standard else ())])
+    return lines, [*proposal.guesses, *remarks(robot, standard)], wrong
 
 
 @run.register
@@ -188,17 +175,16 @@ def run_export(args: flags.Export) -> None:
             f"{robot.description.path}: {text}, but they are to a file of yours: --into"
         )
     say("exporting the controller and comparing it with the live one on a walk")
-    with locked(folder):
-        card = export.export(
-            run.controller if run else walk_config(robot),
-            robot,
-            weights,
-            trajectory.command,
-            folder,
-            name=name,
-            seconds=args.seconds,
-            prefix=args.prefix,
-        )
+    card = export.export(
+        run.controller if run else walk_config(robot),
+        robot,
+        weights,
+        trajectory.command,
+        folder,
+        name=name,
+        seconds=args.seconds,
+        prefix=args.prefix,
+    )
     print_result(args.json, card, lambda: _print_check(card["check"] or {}))
     say(f"the export is in {folder}")
 

@@ -29,7 +29,7 @@ class PathKind(Enum):
     SETS = "nominal, expert, shipped, a weights file, or a folder of one for each trajectory"
     TRAJECTORY = "a name or a TOML file"
     MODEL = "light, heavy or a TOML file of a robot"
-    ROBOT = "a TOML file that names an MJCF: hector robot MODEL --out NAME.toml makes one"
+    ROBOT = "a robot's TOML file: hector robot MODEL --out FOLDER makes one"
 
 
 def named_file(text: str) -> tuple[str, str]:
@@ -342,14 +342,14 @@ class Foretell(ForRobot, ByPlanner, ByMapping, Printed):
 
 @_command
 class Robot(Flags):
-    """Report what a robot's model holds and what is wrong with it, and propose its TOML file.
+    """Report what a robot's model holds and what is wrong with it, and convert it.
 
     Of a TOML file: check it, and fill in what it leaves out.
-    Example: hector robot h1.xml --out h1.toml
+    Example: hector robot h1.xml --out h1
     """
 
     file: Annotated[Path, PathKind.FILE]  # MJCF, URDF, or the TOML file of a robot
-    out: Path | None = None  # new file for the proposal, with its model; else it is printed
+    out: Path | None = None  # new folder for the robot, its TOML file and model; else it is printed
     weld: tuple[str, ...] = ()  # joints to fix, as toes and the rods of parallel ankles
 
 

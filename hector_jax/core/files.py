@@ -93,6 +93,7 @@ def locked(folder: Path) -> Iterator[None]:
 
     The block may lock it again. Waits, with a line on stderr, for another process that holds the
     lock. A killed process releases it; files that its `write_file` left incomplete are removed.
+    The file `.lock` stays: another process may wait for it.
 
     Raises:
         InputError: one line with the folder that cannot be created or written.

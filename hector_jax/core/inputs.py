@@ -3,7 +3,7 @@
 import difflib
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.machinery import PathFinder
 from importlib.util import find_spec
@@ -109,6 +109,24 @@ def unknown(what: str, name: Any, names: Iterable[str]) -> str:
     names = list(names)
     choices = ", ".join(names) or "none"
     return f"unknown {what} {short_repr(name)}{did_you_mean(name, names)}; known: {choices}"
+
+
+def expect(path: Path, condition: Any, message: str) -> None:
+    """Raise InputError `path: message` unless the condition holds."""
+    if not condition:
+        raise InputError(f"{path}: {message}")
+
+
+def require(path: Path, kind: str, name: str, names: Sequence[str], remedy: str = "") -> None:
+    """Raise InputError with the nearest name unless the name is one of the names."""
+    if name not in names:  # the nearest name takes longer to find than all other checks
+        text = f"no {kind} {name!r}{did_you_mean(name, names)}; {kind}s: {listed(names)}"
+        raise InputError(f"{path}: {text}{remedy}")
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return the names that are not empty, joined by commas, or "none"."""
+    return ", ".join(filter(None, names)) or "none"
 
 
 def short_repr(value: Any) -> str:

@@ -199,6 +199,8 @@ def _decoded(path: Path, language: str, decode: Callable[[], Any]) -> Any:
 def from_table(where: str, kind: type[T], table: Any) -> T:
     """Build a dataclass from a table of a file, and nested dataclasses from nested tables.
 
+    A field that is a dict of dataclasses takes a table of tables.
+
     Args:
         where: the file and the place in it, for the message.
         kind: the dataclass, which checks itself; fields without a default are required.
@@ -219,6 +221,10 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
         type_ = by_name[name].type
         types = [x for x in (type_, *get_args(type_)) if isinstance(x, type)]
         inner: Any = next(filter(is_dataclass, types), None)
+        if inner and get_origin(type_) is dict and isinstance(value, Mapping):
+            named = value.items()
+            values[name] = {n: from_table(f"{where}: {name}: {n}", inner, x) for n, x in named}
+            continue
         if inner and value is not None:
             values[name] = from_table(f"{where}: {name}", inner, value)
             continue

@@ -22,7 +22,7 @@ from hector_jax.control.weights import Weights, nominal
 from hector_jax.control.weights_file import WEIGHTS, weights_tree
 from hector_jax.core.console import Broken, say
 from hector_jax.core.environment import versions
-from hector_jax.core.files import as_json, make_folder, write_file, write_json
+from hector_jax.core.files import as_json, locked, write_file, write_json
 from hector_jax.core.inputs import plural
 from hector_jax.core.settings import Range, to_table
 from hector_jax.core.tree_file import tree_hash
@@ -129,33 +129,33 @@ def export(
     given = {"name": name, "content": weights_json, "pieces": len(command.duration)}
     source = controller_source(config, robot, weights, **given)
     with_prefix(source, prefix)  # refuses before the walk what it refuses
-    make_folder(folder)
-    job = Job(weights, command, ideal(robot.description), seconds)
-    recorded = record(config, robot, job)
-    check = _checked(config, robot, source, recorded)
-    # the card has the hashes of the other files: it is removed first and written last
-    (folder / "controller.json").unlink(missing_ok=True)
-    np.savez(archive := io.BytesIO(), **as_arrays(recorded))
-    source = controller_source(config, robot, weights, **given, measured=_times(check))
-    contents = {file: text.encode() for file, text in with_prefix(source, prefix).items()}
-    contents["weights.json"] = weights_json
-    contents[SCHEMA] = (as_json(weights_schema(robot), indent=2) + "\n").encode()
-    if len(robot.foot_point) == 2:  # the C++ controller is for bipeds
-        contents["weights.cpp"] = weights_cpp(weights, config, robot, name=name).encode()
-    contents["check.npz"] = archive.getvalue()
-    for file, content in contents.items():
-        write_file(folder / file, content)
-    card = {
-        "name": name,
-        "sha256": {file: hashlib.sha256(x).hexdigest() for file, x in contents.items()},
-        "weights": weights_tree(weights),
-        "controller": to_table(config),
-        "robot": tree_hash(robot),
-        "versions": versions(),
-        "check": check,
-    }
-    write_json(folder / "controller.json", card)
-    return card
+    with locked(folder):
+        job = Job(weights, command, ideal(robot.description), seconds)
+        recorded = record(config, robot, job)
+        check = _checked(config, robot, source, recorded)
+        # the card has the hashes of the other files: it is removed first and written last
+        (folder / "controller.json").unlink(missing_ok=True)
+        np.savez(archive := io.BytesIO(), **as_arrays(recorded))
+        source = controller_source(config, robot, weights, **given, measured=_times(check))
+        contents = {file: text.encode() for file, text in with_prefix(source, prefix).items()}
+        contents["weights.json"] = weights_json
+        contents[SCHEMA] = (as_json(weights_schema(robot), indent=2) + "\n").encode()
+        if len(robot.foot_point) == 2:  # the C++ controller is for bipeds
+            contents["weights.cpp"] = weights_cpp(weights, config, robot, name=name).encode()
+        contents["check.npz"] = archive.getvalue()
+        for file, content in contents.items():
+            write_file(folder / file, content)
+        card = {
+            "name": name,
+            "sha256": {file: hashlib.sha256(x).hexdigest() for file, x in contents.items()},
+            "weights": weights_tree(weights),
+            "controller": to_table(config),
+            "robot": tree_hash(robot),
+            "versions": versions(),
+            "check": check,
+        }
+        write_json(folder / "controller.json", card)
+        return card
 
 
 def weights_schema(robot: Robot | None = None) -> dict[str, Any]:

@@ -96,24 +96,19 @@ def controller_source(
         InputError: constraints or costs of one's own, which are Python; or a twin.
     """
     sides = [side for part in _constraints(config) for side in _SIDES[part]]
+    table = as_json(to_table(config)).encode()
+    hashes = {"weights": hashlib.sha256(content).hexdigest(), "robot": tree_hash(robot)}
     values = {
+        "config": config,
+        "robot": robot,
+        "name": name,
         "version": versions().get("hector-jax", "of an unknown version"),
-        "robot": tree_hash(robot),
-        "settings": hashlib.sha256(as_json(to_table(config)).encode()).hexdigest(),
-        "title": f"{robot.description.name} with the weights {name}".replace("*/", "* /"),
-        "sha256": hashlib.sha256(content).hexdigest(),
+        "sha256": hashes | {"settings": hashlib.sha256(table).hexdigest()},
         "feet": FEET[len(robot.foot_point)],
-        "joints": robot.description.joints,
-        "com": robot.com_offset,
-        "height": float(robot.standing_height),
-        "fall": dict(zip(("height", "tilt"), robot.description.limits, strict=True)),
         "pieces": max(pieces, PIECES),
         "period": substeps(config),
-        "lead": -first_tick(config) * substeps(config),
         "sides": sides,
         "moments": max(config.mpc.contact.components) > 2,
-        "footholds": config.footstep.rule,
-        "closed_form": robot.structure.closed_form,
         "sizes": _sizes(config, len(sides)),
         "numbers": _numbers(config, robot),
         "tables": _tables(config, robot),
@@ -185,61 +180,37 @@ def _yaml(values: np.ndarray) -> str:
 def _numbers(config: WalkConfig, robot: Robot) -> dict[str, Any]:
     """Return the numbers of controller and robot, in SI units and in ticks."""
     gait, mpc, slip = config.gait, config.mpc, config.slip
-    return {
-        "TICK": gait.tick,
-        "STANCE": gait.stance,
-        "SWING": gait.swing,
-        "CYCLE": gait.cycle,
-        "BEGIN": first_tick(config),
-        "FIRST_TICK": gait.first_tick,
-        "STEPS": mpc.horizon,
-        "STEP_TICKS": mpc.step_ticks,
-        "DT": config.mpc_step,
-        "MASS": robot.mass,
-        "MAX_FORCE": mpc.max_force,
-        "TWIST": mpc.twist,
-        "TOE": robot.toe,
-        "HEEL": robot.heel,
-        "MIDDLE": 0.5 * (robot.toe - robot.heel),
-        "HALF_LENGTH": (half := 0.5 * (robot.toe + robot.heel)),
-        "HALF_WIDTH": (width := mpc.sole_width * robot.half_width),
-        "DIAGONAL": np.hypot(half, width),
-        "SLIP_DISTANCE": slip.distance * robot.standing_height,
-        "SLIP_LOSS": 1.0 - slip.share,
-        "RECOVERY": slip.recovery,
-        "PLACED": len(robot.structure.placed),
-        "NEWTON_STEPS": NEWTON_STEPS,
-        "TOLERANCE": mpc.qp.tolerances(jnp.dtype(float)).residual,
-    }
+    half, width = 0.5 * (robot.toe + robot.heel), mpc.sole_width * robot.half_width
+    numbers = {"TICK": gait.tick, "STANCE": gait.stance, "SWING": gait.swing, "CYCLE": gait.cycle}
+    numbers |= {"BEGIN": first_tick(config), "FIRST_TICK": gait.first_tick}
+    numbers |= {"STEP_TICKS": mpc.step_ticks, "DT": config.mpc_step, "MASS": robot.mass}
+    numbers |= {"MAX_FORCE": mpc.max_force, "TWIST": mpc.twist, "TOE": robot.toe}
+    numbers |= {"HEEL": robot.heel, "MIDDLE": 0.5 * (robot.toe - robot.heel)}
+    numbers |= {"HALF_LENGTH": half, "HALF_WIDTH": width, "DIAGONAL": np.hypot(half, width)}
+    numbers |= {"SLIP_DISTANCE": slip.distance * robot.standing_height}
+    numbers |= {"SLIP_LOSS": 1.0 - slip.share, "RECOVERY": slip.recovery}
+    numbers |= {"PLACED": len(robot.structure.placed), "NEWTON_STEPS": NEWTON_STEPS}
+    return numbers | {"TOLERANCE": mpc.qp.tolerances(jnp.dtype(float)).residual}
 
 
 def _tables(config: WalkConfig, robot: Robot) -> dict[str, Any]:
     """Return the arrays of controller and robot, joints leg by leg."""
-    structure, gait, count = robot.structure, config.gait, len(robot.foot_point)
-    axes, inertia = robot.joint_axis, config.mpc.planned_inertia(robot.inertia)
-    tables = {
-        "LEAD": np.rint(gait.cycle * np.array(gait.offsets)).astype(int),
-        "COMPONENT": np.array(config.mpc.contact.components),
-        "GRAVITY": robot.gravity,
-        "INVERSE_INERTIA": np.linalg.inv(np.asarray(inertia, float)),
-        "COM": robot.com_offset,
-        "FOOT_AHEAD": robot.foot_ahead,
-        "ORIGIN": robot.joint_origin,
-        # the closed form takes its axes as exact
-        "AXIS": np.round(axes) if structure.closed_form else axes,
-        "FOOT_POINT": robot.foot_point,
-        "SOLE": robot.sole,
-        "LINK_MASS": robot.link_mass,
-        "LINK_COM": robot.link_com,
-        "LOWER": robot.joint_lower.reshape(count, -1),
-        "UPPER": robot.joint_upper.reshape(count, -1),
-        "TORQUE_LIMIT": robot.torque_limit,
-        "STANDING": robot.standing_joints.reshape(count, -1),
-        "PLACED_ROW": np.array(structure.placed),
-    }
-    unused = ("STANDING", "PLACED_ROW") if structure.closed_form else ()
-    unused += ("FOOT_AHEAD",) if config.footstep.rule == "paper" else ()
-    return {name: table for name, table in tables.items() if name not in unused}
+    structure, gait, shape = robot.structure, config.gait, (len(robot.foot_point), -1)
+    inertia = np.asarray(config.mpc.planned_inertia(robot.inertia), float)
+    tables = {"LEAD": np.rint(gait.cycle * np.array(gait.offsets)).astype(int)}
+    tables |= {"COMPONENT": np.array(config.mpc.contact.components), "GRAVITY": robot.gravity}
+    tables |= {"INVERSE_INERTIA": np.linalg.inv(inertia), "COM": robot.com_offset}
+    tables |= {"ORIGIN": robot.joint_origin, "AXIS": robot.joint_axis}
+    tables |= {"FOOT_POINT": robot.foot_point, "SOLE": robot.sole}
+    tables |= {"LINK_MASS": robot.link_mass, "LINK_COM": robot.link_com}
+    tables |= {"LOWER": robot.joint_lower.reshape(shape), "UPPER": robot.joint_upper.reshape(shape)}
+    tables |= {"TORQUE_LIMIT": robot.torque_limit}
+    if config.footstep.rule != "paper":
+        tables |= {"FOOT_AHEAD": robot.foot_ahead}
+    if structure.closed_form:  # which takes its axes as exact
+        return tables | {"AXIS": np.round(robot.joint_axis)}
+    standing = robot.standing_joints.reshape(shape)
+    return tables | {"STANDING": standing, "PLACED_ROW": np.array(structure.placed)}
 
 
 def _sizes(config: WalkConfig, sides: int) -> dict[str, Any]:
@@ -247,27 +218,18 @@ def _sizes(config: WalkConfig, sides: int) -> dict[str, Any]:
     feet, steps, model = len(config.gait.offsets), config.mpc.horizon, config.mpc.contact
     contacts, usual = steps * feet, steps * config.gait.most_contacts * model.inputs
     variables, limit = contacts * model.inputs, 100 + 6 * usual
+    numbers = variables * (4 * variables + 23) + contacts * sides * (model.inputs + 1) + 30 * steps
 
     def millions(n: int, active: int, changes: int) -> float:
         """Return multiplications: factorisations, and the changes of the active set."""
         change = 6 * n * n + 9 * n * active + 6 * active**2 + 2 * contacts * sides * model.inputs
         return 1e-6 * (2 * n**3 + changes * change)
 
-    return {
-        "contacts": contacts,
-        "inputs": model.inputs,
-        "components": ", ".join(_COMPONENTS[i] for i in model.components),
-        "sides": sides,
-        "variables": variables,
-        "limit": limit,
-        "kilobytes": round(
-            8e-3 * (variables * (4 * variables + 23) + contacts * sides * (model.inputs + 1))
-        )
-        + 2,
-        "stack": 14 + contacts * sides // 100,
-        "usual": round(millions(usual, usual // 5, usual // 5), 1),
-        "most": round(millions(variables, variables, limit)),
-    }
+    sizes = {"steps": steps, "inputs": model.inputs, "sides": sides, "variables": variables}
+    sizes |= {"components": ", ".join(_COMPONENTS[i] for i in model.components), "limit": limit}
+    sizes |= {"kilobytes": round(8e-3 * numbers) + 2, "stack": 14 + contacts * sides // 100}
+    sizes |= {"usual": round(millions(usual, usual // 5, usual // 5), 1)}
+    return sizes | {"most": round(millions(variables, variables, limit))}
 
 
 def _tunables(

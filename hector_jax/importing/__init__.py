@@ -1,6 +1,6 @@
-"""Propose the settings of a robot that others publish, MJCF or URDF, and say what is likely wrong.
+"""Convert a robot that others publish, MJCF or URDF, to the standard form of `robot.checks`.
 
-`survey`, `soles` and `stand` find legs, feet and standing pose; `propose` adds the settings by
-rules, and writes the model in the standard form that `hector_jax.robot` defines; `table` describes
-the robot, `remarks` its likely faults.
+`published` and `elements` read the file, `survey`, `soles` and `stand` find legs, feet and standing
+pose, or `draft` has them of a TOML; `convert` and `rebuild` write the model, `propose` adds the
+settings by rules. `table` describes the robot, `remarks` its likely faults.
 """

@@ -1,6 +1,6 @@
 """Read the meshes of a robot's feet, where their files are there: vertices for `soles`.
 
-The model of a robot has no meshes (`robot.elements` removes them unopened). For a foot without a
+The model of a robot has no meshes (`elements` removes them unopened). For a foot without a
 shape the meshes that its file names are looked for beside the file, in its folder of meshes and in
 the package around it. STL and OBJ are read by trimesh, DAE and MuJoCo's MSH here. Meshes that
 collide count; those that are only drawn count for a foot that has no other.
@@ -11,6 +11,7 @@ import re
 import struct
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Sequence
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,12 +20,11 @@ import trimesh
 from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import read_text
+from hector_jax.importing.elements import MESHES, compile_bare, parsed, repair_inertias
+from hector_jax.importing.links import Pose, pose_of, subtree
+from hector_jax.importing.published import read_published, read_whole
 from hector_jax.importing.survey import Survey
-from hector_jax.robot.elements import MESHES, parsed, repair_inertias
-from hector_jax.robot.links import Pose, pose_of, rotation_of, subtree
-from hector_jax.robot.mjcf import MOST_BYTES, read_mjcf
-from hector_jax.robot.source import compile_bare
+from hector_jax.robot.poses import rotation_of
 
 _LARGEST = 64_000_000  # [bytes] of a mesh
 _PARENTS = 5  # folders above the model, of which one is the package's
@@ -58,8 +58,8 @@ class FootMeshes(NamedTuple):
 
 def foot_meshes(survey: Survey, data: mujoco.MjData) -> FootMeshes:
     """Return the vertices of the meshes of each foot in a pose of the survey's model."""
-    path, model = survey.path, survey.model
-    urdf = read_mjcf(path).tag == "robot"
+    path, model = survey.file.path, survey.file.model
+    urdf = survey.file.root.tag == "robot"
     geoms = list(_of_urdf(path) if urdf else _of_mjcf(path))
     points, files, missing = [], [], []
     for leg in survey.legs:
@@ -68,7 +68,7 @@ def foot_meshes(survey: Survey, data: mujoco.MjData) -> FootMeshes:
         own = [geom for geom in own if geom.collides] or own
         of_leg = []
         for geom in own:
-            file = _find(path, geom)
+            file = _find(path, geom.file, geom.folder)
             vertices = None if file is None else _vertices(file)
             (missing if vertices is None else files).append(Path(geom.file.replace("\\", "/")).name)
             if vertices is not None:
@@ -80,8 +80,7 @@ def foot_meshes(survey: Survey, data: mujoco.MjData) -> FootMeshes:
 
 
 def _of_urdf(path: Path) -> Iterator[MeshGeom]:
-    root = ElementTree.fromstring(read_text(path, "the robot description", MOST_BYTES))
-    for link in root.findall("link"):
+    for link in read_whole(path).findall("link"):
         for part in link:
             mesh, origin = part.find("geometry/mesh"), part.find("origin")
             if mesh is None or part.tag not in ("collision", "visual"):
@@ -102,8 +101,8 @@ def _of_urdf(path: Path) -> Iterator[MeshGeom]:
 
 
 def _of_mjcf(path: Path) -> Iterator[MeshGeom]:
-    root = read_mjcf(path)
-    spec, _, _ = parsed(path, root, (), None)
+    root = read_published(path)
+    spec, _, _ = parsed(path, root)
     repair_inertias(path, spec)
     meshes = {mesh.name: mesh for mesh in spec.meshes}
     found = {}
@@ -136,18 +135,45 @@ def _of_mjcf(path: Path) -> Iterator[MeshGeom]:
         )
 
 
+def resolved(path: Path) -> dict[str, bytes]:
+    """Return a model that needs nothing outside its folder, and its meshes, by name there.
+
+    What it includes is in it, and it names the meshes where they are to be.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    root, meshes = read_whole(path), {}
+    key = "filename" if root.tag == "robot" else "file"
+    folders = ("meshdir", "assetdir")
+    compilers = [x for x in root.iter("compiler") if {*folders} & {*x.attrib}]
+    folder = next((x.get("meshdir") or x.get("assetdir", "") for x in compilers), "")
+    for part in root.iter("mesh"):
+        if file := _find(path, part.get(key, ""), folder):
+            content, name = file.read_bytes(), f"meshes/{file.name}"
+            while meshes.get(name, content) != content:  # another file of the same name
+                name = f"{name.removesuffix(file.suffix)}_{file.suffix}"
+            meshes[name] = content
+            if key == "file":
+                part.set("name", part.get("name", file.stem))  # by default that of the file
+            part.set(key, name)
+    for part, name in product(compilers if meshes else (), folders):
+        part.attrib.pop(name, None)
+    return {path.name: ElementTree.tostring(root), **meshes}
+
+
 def _three(text: str) -> list[float]:
     return [float(x) for x in text.split()][:3]
 
 
-def _find(path: Path, geom: MeshGeom) -> Path | None:
-    """Return the file of a mesh; None if it is not there."""
-    name = re.sub(r"^\$\(find ([^)]*)\)", r"package://\1", geom.file.replace("\\", "/"))
+def _find(path: Path, file: str, folder: str) -> Path | None:
+    """Return the file of a mesh that a model names; None if it is not there."""
+    name = re.sub(r"^\$\(find ([^)]*)\)", r"package://\1", file.replace("\\", "/"))
     scheme, _, rest = name.rpartition("://")
     relative = Path(rest)
     if relative.is_absolute() or relative.suffix.lower() not in _READERS:
         return None
-    places = [path.parent / geom.folder / relative, path.parent / relative]
+    places = [path.parent / folder / relative, path.parent / relative]
     for parent in list(path.absolute().parents)[:_PARENTS] if scheme else []:
         places += [parent / relative, parent / Path(*relative.parts[1:])]
     places += [x / "meshes" / relative.name for x in list(path.absolute().parents)[:2]]

@@ -30,20 +30,32 @@ of mass m and height h:
 
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from hector_jax.core.inputs import InputError
-from hector_jax.core.settings import from_table, read_toml
+from hector_jax.core.files import write_file
+from hector_jax.core.inputs import InputError, expect
+from hector_jax.core.settings import as_toml, from_table, read_toml
 from hector_jax.core.trajectory import FEET
+from hector_jax.importing.convert import Standard, guessed_numbers, short, to_standard
+from hector_jax.importing.draft import PublishedJoints, draft_of
+from hector_jax.importing.elements import read_file
+from hector_jax.importing.meshes import resolved
 from hector_jax.importing.soles import Sole, find_soles
 from hector_jax.importing.stand import standing_pose
 from hector_jax.importing.survey import Survey, survey_file
-from hector_jax.robot.checks import expect
-from hector_jax.robot.description import MAX_BYTES, Description, Joints, description_of
-from hector_jax.robot.links import data_at, subtree
+from hector_jax.robot.description import (
+    HECTOR_NAMES,
+    MAX_BYTES,
+    Description,
+    Joints,
+    description_of,
+    model_name,
+)
 from hector_jax.robot.model import Robot, build_model, conversion, robot_of
 from hector_jax.robot.response import (
     Response,
@@ -52,37 +64,35 @@ from hector_jax.robot.response import (
     swing_frequency,
     trunk_gain,
 )
-from hector_jax.robot.source import nor, without_limits
 
 MASS, HEIGHT = 12.0, 0.423  # of HECTOR [kg], [m]
 _TICK = 0.01  # [s] of the gait
 _ANGLE, _RATE = 50.0, 1.0  # weights Q of attitude and angular velocity
 _KP_PER_LIMIT = 2.0  # [1/rad]
 _NAMES = ("name", "model", "standing", "joints", "feet")  # what is found, not ruled
-_OF_FILE = ("weld", "armature", "range", "torque")  # of a model that is not in the standard form
-_HALF_TURN = 3.14  # [rad]: range of a joint that has none
-_TORQUE = 0.6  # torque limit of a joint that has none, by weight and length of a leg; HECTOR 0.6
-_ARMATURE_PER_LIMIT = 2e-4  # [s^2]: HECTOR's has 2.4e-4, Unitree's robots 1e-4 to 4e-4
+TOML, MODEL = "robot.toml", "robot.xml"  # names of the files of a robot in the standard form
 
 
 class RobotProposal(NamedTuple):
     """The proposed TOML of a file, as far as its rules go."""
 
-    table: dict[str, Any]
-    wrong: tuple[str, ...]  # one line per problem to correct by hand
+    table: dict[str, Any]  # beside the file as it is published
+    wrong: tuple[str, ...] = ()  # one line per problem to correct by hand
     guesses: tuple[str, ...] = ()  # one line per number that the file does not have
     filled: Sequence[str] = ()  # keys that the file does not have, which are proposed
     survey: Survey | None = None  # None: the file names all, or it has no legs
     soles: tuple[Sole, ...] = ()
-    robot: Robot | None = None  # None: it cannot be built
+    standard: Standard | None = None  # None: it cannot be converted, or need not be
+    robot: Robot | None = None  # in the standard form; None: it cannot be built
     error: str | None = None  # why the robot cannot be used
 
 
-def propose_robot(path: Path, weld: Sequence[str] = ()) -> RobotProposal:
-    """Return the proposed TOML of a model's file, or of a TOML file with what it leaves out.
+def propose_robot(path: Path, folder: Path, weld: Sequence[str] = ()) -> RobotProposal:
+    """Convert a robot to the standard form, and propose what a TOML of it leaves out.
 
     Args:
-        path: of the file.
+        path: MJCF or URDF as published, or a robot's TOML file.
+        folder: new one for the converted robot, whose description names its files there.
         weld: joints that are fixed, so that they are of no leg.
 
     Raises:
@@ -93,53 +103,104 @@ def propose_robot(path: Path, weld: Sequence[str] = ()) -> RobotProposal:
         own = read_toml(path, "the robot description", MAX_BYTES)
         if weld:
             raise InputError(f"--weld is for a model; in {path} write joints.weld")
-    file = description_of(path, {"name": "robot", "model": own.get("model", "")}).model
-    wrong, error = [], None
+    model_name(path, own)
     stem = "".join(x if x.isalnum() or x in "-_" else "-" for x in path.stem)
-    found = RobotProposal({"name": stem, **own}, ())
+    first, wrong = RobotProposal({"name": stem, **own}), []
+    found = first
     try:
-        with conversion(file):
-            named = _named_legs(path, own)
-            if not (named and "feet" in own and "standing" in own):
-                found = _with_legs(survey_file(file, named, (*weld, *_welded(own))), found)
-                found = _with_feet(found, wrong)
-            names = {key: found.table[key] for key in _NAMES if key in found.table}
-            description = description_of(path.with_suffix(".toml"), names)
-            if found.survey:
-                limits, lines = _limits(description, found.survey)
-                names["joints"] = _merged(limits, names["joints"])
-                found = found._replace(guesses=(*found.guesses, *lines))
-                description = description_of(description.path, names)
-            if armature := _armature(description):
-                names["joints"] = _merged({"armature": armature}, names["joints"])
-                description = description_of(description.path, names)
-            robot = robot_of(description, checked=False)
-            table = _merged(_settings(robot), found.table | names)
-            description = description_of(description.path, table)
-            found = found._replace(table=table, robot=robot._replace(description=description))
-            robot_of(description)
+        for stage in _stages(path, folder / MODEL, first, weld, wrong):
+            found = stage
     except InputError as raised:
-        error = str(raised)
-        wrong.append(error)
-    return found._replace(wrong=tuple(wrong), filled=_left_out(found.table, own), error=error)
+        wrong.append(str(raised))
+        found = found._replace(error=str(raised))
+    return found._replace(wrong=tuple(wrong), filled=_left_out(found.table, own))
 
 
-def standard_form(proposal: RobotProposal, model: str) -> tuple[dict[str, Any], str]:
-    """Return TOML table and MJCF of a proposed robot in the standard form, which has all names.
+def _stages(
+    path: Path, model: Path, found: RobotProposal, weld: Sequence[str], wrong: list[str]
+) -> Iterator[RobotProposal]:
+    """Yield what is found of a robot, more each time, and write its model in the standard form."""
+    source, toml, own = path.parent / found.table["model"], path.with_suffix(".toml"), found.table
+    with _told_of(source, model):
+        if robot := _in_standard_form(path, own):
+            names = {key: x for key, x in HECTOR_NAMES.items() if key not in own}
+            found = found._replace(table=own | names)
+        else:
+            file, named = read_file(source), _named_legs(path, own)
+            if not (named and "feet" in own and "standing" in own):
+                yield (found := _with_legs(survey_file(file, named, (*weld, *_welded(own))), found))
+                yield (found := _with_feet(found, wrong))
+            draft = draft_of(toml, found.table)
+            joints, lines = guessed_numbers(file, draft)
+            table = _merged({"joints": joints}, found.table)
+            yield (found := found._replace(table=table, guesses=(*found.guesses, *lines)))
+            standard = to_standard(file, draft_of(toml, table), str(table["name"]))
+            write_file(model, standard.text.encode())
+            found = found._replace(standard=standard)
+            names = {key: x for key, x in table.items() if key in _NAMES}
+            bare = _description(toml, found._replace(table=names), model)
+            robot = robot_of(bare, checked=False)
+        found = found._replace(table=_merged(_settings(robot), found.table))
+        description = _description(toml, found, model)
+        yield found._replace(robot=robot._replace(description=description))
+        build_model(description)
+
+
+@contextmanager
+def _told_of(source: Path, model: Path) -> Iterator[None]:
+    """Raise all errors of a conversion as InputErrors of the source, not of the new model."""
+    try:
+        with conversion(source):
+            yield
+    except InputError as error:
+        raise InputError(str(error).replace(str(model), str(source))) from error
+
+
+def _in_standard_form(path: Path, own: dict[str, Any]) -> Robot | None:
+    """Return the robot of a TOML file, None unless it is in the standard form and stands."""
+    if path.suffix == ".toml":
+        with suppress(InputError):
+            return robot_of(description_of(path, own))
+    return None
+
+
+def _description(toml: Path, found: RobotProposal, model: Path) -> Description:
+    """Return the description of a proposed robot, of which the model may be in another folder."""
+    description = description_of(toml, _standard_table(found))
+    return replace(description, model=model) if found.standard else description
+
+
+def _standard_table(found: RobotProposal) -> dict[str, Any]:
+    """Return the TOML table of a proposed robot in the standard form."""
+    if found.standard is None:
+        return found.table
+    own = {field.name for field in fields(Joints)}
+    joints = {key: x for key, x in found.table["joints"].items() if key in own}
+    names = {"name": found.table["name"], "model": MODEL, "standing": "standing", "joints": joints}
+    names["feet"] = found.standard.feet
+    return names | {key: x for key, x in found.table.items() if key not in names}
+
+
+def files_of(proposal: RobotProposal, path: Path, comments: Sequence[str]) -> dict[str, bytes]:
+    """Return the files of a folder of its own for a robot, by name.
+
+    They are the robot in the standard form; or, if something is wrong, a draft of it with all that
+    its model includes, and its meshes.
 
     Args:
-        proposal: of a robot that can be used.
-        model: name of the file of the MJCF.
+        proposal: of the robot.
+        path: file that it was made of.
+        comments: first lines of the TOML.
     """
-    assert proposal.robot is not None
-    description, table = proposal.robot.description, proposal.table
-    joints = {key: x for key, x in table["joints"].items() if key not in _OF_FILE}
-    feet = {
-        leg: {"point": foot.point, "contacts": list(foot.contacts)}
-        for leg, foot in zip(description.legs, description.named_feet, strict=True)
-    }
-    named = {"standing": description.standing_key, "joints": joints, "feet": feet}
-    return table | {"model": model} | named, build_model(description)[0].to_xml()
+    table, source = _standard_table(proposal), path.parent / proposal.table["model"]
+    if not proposal.wrong:
+        text = proposal.standard.text.encode() if proposal.standard else source.read_bytes()
+        table, files = table | {"model": MODEL}, {MODEL: text}
+    else:
+        table, files = proposal.table, {}
+        with suppress(InputError):  # told already
+            files = resolved(source)
+    return {TOML: as_toml(table, comments).encode(), **files}
 
 
 def _named_legs(path: Path, own: dict[str, Any]) -> list[tuple[str, ...]]:
@@ -147,7 +208,7 @@ def _named_legs(path: Path, own: dict[str, Any]) -> list[tuple[str, ...]]:
     joints = own.get("joints", {})
     if isinstance(joints, dict) and not {*joints} & {*sum(FEET.values(), ())}:
         return []
-    return list(from_table(f"{path}: joints", Joints, joints).legs.values())
+    return list(from_table(f"{path}: joints", PublishedJoints, joints).legs.values())
 
 
 def _welded(own: dict[str, Any]) -> list[str]:
@@ -160,7 +221,7 @@ def _welded(own: dict[str, Any]) -> list[str]:
 def _with_legs(survey: Survey, found: RobotProposal) -> RobotProposal:
     """Return a proposal with the legs of a survey; what its table has stays."""
     legs = zip(FEET[len(survey.legs)], survey.legs, strict=True)
-    joints: dict[str, Any] = {x: [survey.model.joint(j).name for j in leg] for x, leg in legs}
+    joints: dict[str, Any] = {x: [survey.file.joints[j] for j in leg] for x, leg in legs}
     joints |= {"weld": list(survey.weld)} if survey.weld else {}
     return found._replace(survey=survey, table=_merged({"joints": joints}, found.table))
 
@@ -210,7 +271,7 @@ def _merged(rules: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
         for key, value in rules.items()
         if isinstance(value, dict) and isinstance(own.get(key), dict)
     }
-    return {**{key: x for key, x in own.items() if key not in rules}, **rules, **own, **both}
+    return own | {key: x for key, x in rules.items() if key not in own} | both
 
 
 def _left_out(table: dict[str, Any], own: dict[str, Any], prefix: str = "") -> list[str]:
@@ -228,7 +289,7 @@ def _settings(robot: Robot) -> dict[str, Any]:
     """Return the part of the TOML with the settings that follow from the rules."""
     height, weight = float(robot.standing_height), float(robot.mass * robot.gravity[2])
     mass, size = float(robot.mass) / MASS, height / HEIGHT  # relative to HECTOR's
-    root, torque = math.sqrt(size), _short(mass * size)
+    root, torque = math.sqrt(size), short(mass * size)
     ticks = round(20 * root)
     four, flat = len(robot.foot_point) == 4, robot.structure.contact == "flat"
     step_ticks, answer = max(3, math.ceil(0.15 * ticks)), response(robot)
@@ -256,51 +317,16 @@ def _settings(robot: Robot) -> dict[str, Any]:
             "gravity_compensation": True,
         },
         "weights": _weights(mass, size),
-        "loss": {"L_ctrl": _short(mass**-2)},
+        "loss": {"L_ctrl": short(mass**-2)},
         "tuning": {"lead": 2 * ticks, "touchdown_error": True, "estimate_noise": 1, "delay": 0.005},
         "plants": {
             "joint_friction": torque,
             "joint_damping": torque,
-            "push": _short(mass),
-            "trunk_com": _short(size),
-            "payload": _short(mass),
+            "push": short(mass),
+            "trunk_com": short(size),
+            "payload": short(mass),
         },
     }
-
-
-def _limits(description: Description, survey: Survey) -> tuple[dict[str, Any], list[str]]:
-    """Return ranges and torque limits of a leg's joints where the file has none; and lines."""
-    without_range, without_torque = without_limits(description)
-    joints: dict[str, Any] = {}
-    lines = []
-    if without_range:
-        joints["range"] = [[-_HALF_TURN, _HALF_TURN]] * description.leg_joints
-        lines.append(
-            f"joint {nor(without_range).format('range')}: half a turn to both sides is a guess; "
-            "write joints.range, or limits into the model"
-        )
-    if without_torque:
-        data = data_at(survey.model)
-        mass = float(survey.model.body_subtreemass[survey.trunk])
-        last = subtree(survey.model, int(survey.model.jnt_bodyid[survey.legs[0][-1]]))
-        length = float(data.xanchor[survey.legs[0][0]][2] - data.xipos[last][:, 2].min())
-        torque = _short(_TORQUE * mass * float(np.linalg.norm(survey.model.opt.gravity)) * length)
-        joints["torque"] = [torque] * description.leg_joints
-        lines.append(
-            f"joint {nor(without_torque).format('torque limit')}: {torque:g} N m, {_TORQUE} times "
-            "weight and length of a leg, is a guess; write joints.torque, or limits of motors "
-            "(effort in a URDF) into the model; a joint without a motor belongs into joints.weld"
-        )
-    return joints, lines
-
-
-def _armature(description: Description) -> list[float] | None:
-    """Return the armature of a leg's motors [kg m^2] by the rule, None if the file has all."""
-    _, model = build_model(description, checked=False)
-    count = description.leg_joints
-    armature = model.dof_armature[6 : 6 + count]
-    default = _ARMATURE_PER_LIMIT * model.actuator_ctrlrange[:count, 1]
-    return None if armature.all() else [_short(x) for x in np.where(armature, armature, default)]
 
 
 def _gains(robot: Robot, answer: Response) -> dict[str, list[float]]:
@@ -312,7 +338,7 @@ def _gains(robot: Robot, answer: Response) -> dict[str, list[float]]:
     path = robot.description.model
     expect(path, np.isfinite(frequency), f"no gains hold the swing legs; {text}")
     kp = np.minimum(inertia * frequency**2, _KP_PER_LIMIT * limit)
-    return {"kp": [_short(x) for x in kp], "kd": [_short(x) for x in np.sqrt(kp * inertia)]}
+    return {"kp": [short(x) for x in kp], "kd": [short(x) for x in np.sqrt(kp * inertia)]}
 
 
 def _weights(mass: float, size: float) -> dict[str, Any]:
@@ -324,19 +350,14 @@ def _weights(mass: float, size: float) -> dict[str, Any]:
             "euler": _ANGLE,
             "position": [50, 50, 250],
             **rates,
-            "force": _short(0.3e-4 * force),
-            "moment": _short(0.3e-3 * moment),
+            "force": short(0.3e-4 * force),
+            "moment": short(0.3e-3 * moment),
         },
         "expert": {
             "euler": [100, 100, 250],
             "position": [200, 200, 300],
             **rates,
-            "force": [_short(x * force) for x in (1e-4, 1e-4, 5e-4)],
-            "moment": _short(1e-2 * moment),
+            "force": [short(x * force) for x in (1e-4, 1e-4, 5e-4)],
+            "moment": short(1e-2 * moment),
         },
     }
-
-
-def _short(x: float) -> float:
-    """Return a number rounded to three digits."""
-    return float(f"{x:.3g}")

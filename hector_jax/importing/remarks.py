@@ -6,12 +6,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hector_jax.core.headless import mujoco
+from hector_jax.importing.convert import UNITS, Standard
 from hector_jax.importing.survey import places_of
-from hector_jax.robot.checks import standing_data
 from hector_jax.robot.description import Description
-from hector_jax.robot.links import data_at
 from hector_jax.robot.model import Robot, build_model, quiet_mujoco
-from hector_jax.robot.source import UNITS, Source, build_spec
+from hector_jax.robot.poses import data_at, standing_data
 
 _HEAVY_LEGS = 0.35  # share of the robot's mass
 _UNLIKE = 0.05  # least relative difference of the legs of a pair that is told
@@ -27,13 +26,18 @@ Sides = tuple[Float[np.ndarray, "j n"], Float[np.ndarray, "j n"]]
 
 
 @quiet_mujoco()
-def remarks(robot: Robot) -> list[str]:
-    """Return one line per likely cause of trouble in walking, with its remedy."""
-    description, source = robot.description, build_spec(robot.description)
-    model = source.spec.compile()
+def remarks(robot: Robot, standard: Standard | None = None) -> list[str]:
+    """Return one line per likely cause of trouble in walking, with its remedy.
+
+    Args:
+        robot: in the standard form.
+        standard: what it was converted from, if it was.
+    """
+    description, model = robot.description, build_model(robot.description, checked=False)[1]
     share, weight = float(robot.link_mass.sum() / robot.mass), float(robot.mass * robot.gravity[2])
     control = {name: dict(section) for name, section in description.control}
-    lines = [*_units(robot), *differences(robot), *_overlaps(source, model)]
+    lines = [*_units(robot), *differences(robot)]
+    lines += [*_overlaps(standard, model)] if standard else []
     lines += [*_places(description), *_springs(robot, model)]
     if share > _HEAVY_LEGS and not control.get("legs", {}).get("gravity_compensation"):
         lines.append(
@@ -44,7 +48,7 @@ def remarks(robot: Robot) -> list[str]:
     if missing := [n for n in names if not model.dof_armature[model.joint(n).dofadr[0]]]:
         lines.append(
             f"joint {missing[0]!r} has no armature, without which backlash cannot be simulated: "
-            "set joints.armature"
+            "give it one in the model"
         )
     if len(description.feet) == 2 and np.abs(robot.joint_axis[..., 2]).max() < 0.5:
         lines.append("no joint of a leg turns about z: the robot may fall in curves, walk straight")
@@ -116,7 +120,7 @@ def differences(robot: Robot) -> list[str]:
     return lines
 
 
-def _overlaps(source: Source, model: mujoco.MjModel) -> Iterator[str]:
+def _overlaps(source: Standard, model: mujoco.MjModel) -> Iterator[str]:
     """Yield one line for each two links that touch, standing, and do not in the file."""
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(data.model, data, 0)

@@ -20,13 +20,14 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
 from hector_jax.core.headless import mujoco
+from hector_jax.core.inputs import expect
 from hector_jax.core.trajectory import FEET
+from hector_jax.importing.links import subtree
 from hector_jax.importing.meshes import foot_meshes
 from hector_jax.importing.survey import MIN_Y, Survey
-from hector_jax.robot.checks import expect
+from hector_jax.robot.checks import SHAPES
 from hector_jax.robot.description import FEWEST_JOINTS
-from hector_jax.robot.links import data_at, subtree
-from hector_jax.robot.rebuild import SHAPES
+from hector_jax.robot.poses import data_at
 
 _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = SHAPES
 _SAME_SOLE = 5e-3  # [m] above the lowest point
@@ -82,8 +83,6 @@ def find_soles(survey: Survey, angles: Mapping[str, float] | None = None) -> tup
                 else "it has no mesh"
             )
             points = [_inertia_box(data, leg) - origin for leg, origin, _ in feet]
-    elif named := _named_soles(survey, data):
-        return named
     outlines = [_outline(of_foot, len(survey.legs[0])) for of_foot in points]
     tolerance, soles = _GUESS_TOLERANCE if guessed or files else _TOLERANCE, []
     names = FEET[len(survey.legs)]
@@ -92,7 +91,7 @@ def find_soles(survey: Survey, angles: Mapping[str, float] | None = None) -> tup
         text = f"the {names[first]} foot touches at {np.round(left, 4).tolist()} from its last "
         text += f"joint and the mirrored {names[first + 1]} one at {np.round(right, 4).tolist()}"
         same = len(left) == len(right) and np.abs(left - right).max() <= tolerance
-        expect(survey.path, same, f"{text}, expected the same")
+        expect(survey.file.path, same, f"{text}, expected the same")
         mean = np.round(0.5 * (left + right), 4)
         for i, contacts in ((first, mean), (first + 1, _mirrored(mean))):
             joint = survey.legs[i][-1]
@@ -285,27 +284,3 @@ def _sole(
     if contacts[:, 0].min() < ankle - 1e-3 < ankle + 1e-3 < contacts[:, 0].max():
         under[0] = ankle  # whose motor then has least to bear
     return Sole(section, contacts, under, axes)
-
-
-def _named_soles(survey: Survey, data: mujoco.MjData) -> tuple[Sole, ...] | None:
-    """Return the soles if each foot has two named spheres and a named site, as HECTOR's have."""
-    model, soles = survey.model, []
-    for leg in survey.legs:
-        geoms, body = _foot_geoms(model, leg), int(model.jnt_bodyid[leg[-1]])
-        sites = np.flatnonzero(model.site_bodyid == body)
-        if len(geoms) != 2 or len(sites) != 1 or not (site := model.site(sites[0])).name:
-            return None
-        if any(
-            model.geom_type[g] != _SPHERE or not model.geom(g).name or model.geom_bodyid[g] != body
-            for g in geoms
-        ):
-            return None
-        anchor = data.xanchor[leg[-1]]
-        heel, toe = sorted(geoms, key=lambda g: data.geom_xpos[g][0])
-        contacts = np.concatenate([_support(data, g) for g in (toe, heel)]) - anchor
-        point = data.site_xpos[sites[0]] - anchor
-        if np.abs(contacts[:, 2] - point[2]).max() > 1e-3:
-            return None
-        names = {"point": site.name, "toe": model.geom(toe).name, "heel": model.geom(heel).name}
-        soles.append(Sole(names, contacts, point, np.eye(3)))
-    return tuple(soles)

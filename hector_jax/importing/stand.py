@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from hector_jax.core.headless import mujoco
 from hector_jax.importing.soles import Sole
 from hector_jax.importing.survey import Survey, hip
-from hector_jax.robot.links import data_at
+from hector_jax.robot.poses import data_at
 
 KNEE = 1.0  # [rad] of the first trial
 _NEARLY_STRAIGHT = 0.1  # [rad] of a knee at zero: offsets of a design, which are no bend

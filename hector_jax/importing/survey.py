@@ -19,12 +19,11 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
-from hector_jax.robot.checks import expect, require
+from hector_jax.core.inputs import expect, require
+from hector_jax.importing.elements import File, check_couplings
+from hector_jax.importing.links import subtree
 from hector_jax.robot.description import FEWEST_JOINTS, MOST_JOINTS
-from hector_jax.robot.elements import check_couplings, spec_of
-from hector_jax.robot.links import data_at, subtree
-from hector_jax.robot.mjcf import read_mjcf
-from hector_jax.robot.source import compile_bare
+from hector_jax.robot.poses import data_at
 
 _HINGE, _FREE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
 _MIRROR_TOLERANCE = 0.03  # [m] between a joint and the mirror image of the other leg's
@@ -42,8 +41,7 @@ _PLACES = {  # words for them in names
 class Survey(NamedTuple):
     """The robot found in a file."""
 
-    path: Path
-    model: mujoco.MjModel  # without motors, keyframes and meshes
+    file: File
     trunk: int  # body
     legs: tuple[tuple[int, ...], ...]  # joints, in the order of `FEET`, from the trunk down
     weld: tuple[str, ...]  # joints outside the legs
@@ -51,43 +49,44 @@ class Survey(NamedTuple):
     straight: tuple[float, ...]  # [rad] of each leg's knee, where hip, knee and end are in line
     forwards: tuple[bool, ...]  # knees point ahead, for each pair of legs
 
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The file as MuJoCo compiles it."""
+        return self.file.model
+
 
 def survey_file(
-    path: Path, named: Sequence[Sequence[str]] = (), welded: Sequence[str] = ()
+    file: File, named: Sequence[Sequence[str]] = (), welded: Sequence[str] = ()
 ) -> Survey:
     """Find the robot in a file by the rules of the module's docstring.
 
     Args:
-        path: of the file.
+        file: with the robot.
         named: joints of each leg in the order of `FEET`, if they are known.
         welded: joints that are fixed, and of no leg.
 
     Raises:
         InputError: one line with the missing part and the remedy.
     """
-    root = read_mjcf(path)
-    spec, _ = spec_of(path, root, (), None)
-    model = compile_bare(path, root, spec)
+    path, model, names = file.path, file.model, file.joints
     free = [j for j in range(model.njnt) if model.jnt_type[j] == _FREE]
-    names = ", ".join(model.joint(j).name for j in free)
-    expect(path, len(free) < 2, f"free joints {names}, expected one at most, the trunk's")
+    text = f"free joints {', '.join(names[j] for j in free)}, expected one at most, the trunk's"
+    expect(path, len(free) < 2, text)
     data = data_at(model)
     for joint in (*sum(map(tuple, named), ()), *welded):
-        require(path, "joint", joint, [model.joint(j).name for j in range(model.njnt)])
-    legs = tuple(tuple(model.joint(joint).id for joint in leg) for leg in named)
-    legs = legs or _legs(path, data, [*free, *(model.joint(joint).id for joint in welded)])
-    joints = [model.joint(j).name for j in sum(legs, ())]
-    check_couplings(path, read_mjcf(path), joints, welded)
+        require(path, "joint", joint, names)
+    legs = tuple(tuple(names.index(joint) for joint in leg) for leg in named)
+    legs = legs or _legs(path, data, [*free, *(names.index(joint) for joint in welded)])
+    check_couplings(file, [names[j] for j in sum(legs, ())], welded)
     trunk = int(model.jnt_bodyid[free[0]] if free else model.body_rootid[_body(model, legs[0][0])])
     others = [j for j in range(model.njnt) if j not in sum(legs, (*free,))]
     knee = _knee(path, data, legs[0])
     knees = [_knee_bend(data, leg, knee) for leg in legs]
     return Survey(
-        path=path,
-        model=model,
+        file=file,
         trunk=trunk,
         legs=legs,
-        weld=tuple(model.joint(j).name for j in others),
+        weld=tuple(names[j] for j in others),
         knee=knee,
         straight=tuple(straight for straight, _ in knees),
         forwards=tuple(ahead for _, ahead in knees[::2]),

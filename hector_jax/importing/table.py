@@ -8,10 +8,9 @@ import numpy as np
 from hector_jax.core.headless import mujoco
 from hector_jax.importing.remarks import numbers, pairs_of, range_words, words_of
 from hector_jax.importing.survey import axis_words
-from hector_jax.robot.checks import standing_data, trunk_body
 from hector_jax.robot.kinematics import knee_joints
 from hector_jax.robot.model import Robot, build_model, quiet_mujoco
-from hector_jax.robot.source import build_spec
+from hector_jax.robot.poses import standing_data, trunk_body
 
 _COLUMNS = {
     "axis": axis_words,
@@ -24,8 +23,8 @@ _WIDTH = 91  # of the names of a line
 
 
 @quiet_mujoco()
-def table_of(robot: Robot) -> list[str]:
-    """Return the table of a robot, line by line."""
+def table_of(robot: Robot, fixed: Sequence[str] = ()) -> list[str]:
+    """Return the table of a robot, of which some joints are fixed, line by line."""
     description, model = robot.description, build_model(robot.description, checked=False)[1]
     count = description.leg_joints
     share = float(robot.link_mass.sum() / robot.mass)
@@ -35,7 +34,6 @@ def table_of(robot: Robot) -> list[str]:
         for left, right, has in pairs_of(robot, model)
         for i in range(count)
     ]
-    fixed = ", ".join(description.weld) or "no joint"
     return [
         f"robot    {description.name}: {robot.mass:.4g} kg, trunk {trunk!r}; standing, its centre "
         f"of mass is {robot.standing_height:.3g} m high",
@@ -43,21 +41,17 @@ def table_of(robot: Robot) -> list[str]:
         f"{_knees(_knees_ahead(robot, model))}",
         *_columns([("joint", *_COLUMNS), *rows]),
         f"feet     {robot.structure.contact}: {_sole(robot)}",
-        *section("fixed", textwrap.wrap(fixed, _WIDTH, break_on_hyphens=False)),
+        *section(
+            "fixed", textwrap.wrap(", ".join(fixed) or "no joint", _WIDTH, break_on_hyphens=False)
+        ),
     ]
-
-
-def changes_of_model(robot: Robot) -> list[str]:
-    """Return one line per change that was made to the model of the robot's file."""
-    # the table lists what is fixed
-    return [x for x in build_spec(robot.description).notes if not x.startswith("fixed: ")]
 
 
 def _knees_ahead(robot: Robot, model: mujoco.MjModel) -> list[bool]:
     """Return whether the knees are ahead of the legs, standing, for each pair of legs."""
     data, (hip, knee, ankle) = standing_data(robot.description, model), knee_joints(robot)
     anchors = data.xanchor[1:].reshape(len(robot.foot_point), -1, 3)
-    ends = [data.site(foot.point).xpos for foot in robot.description.named_feet]
+    ends = [data.site(foot.point).xpos for foot in robot.description.feet]
     ends = anchors[:, ankle] if ankle > knee else np.array(ends)
     (x, _, z), (u, _, w) = (anchors[:, knee] - anchors[:, hip]).T, (ends - anchors[:, knee]).T
     return (z * u > x * w)[::2].tolist()

@@ -108,9 +108,10 @@ def find_conventions(
     twin = config.twin
     for names in (twin.legs, twin.joint_legs):
         leg_order(robot, names)  # of which no reading could tell that they are wrong
-    plain = replace(twin, **{x.name: x.default for x in fields(twin) if x.name in (*LOG, *MODEL)})
+    given = {x.name: x.default for x in fields(twin) if x.name in (*LOG, *MODEL)}
     if twin.com is not None:  # whose height cannot be left out
-        plain = replace(plain, height=twin.height)
+        given["height"] = twin.height
+    plain = replace(twin, **given)
     log = _Log(read, replace(config, twin=plain), robot, weights, command)
     fit = as_is = Fit(twin, log.error(twin))
     if not np.isfinite(as_is.error) and all(

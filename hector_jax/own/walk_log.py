@@ -16,7 +16,6 @@ from hector_jax.core.settings import convert
 from hector_jax.core.trajectory import SOLVED, Belief, State, Trajectory, Wrench, no_samples
 from hector_jax.core.tree_file import read_card, tree_hash
 from hector_jax.own.walk_file import read_walk, reference_of
-from hector_jax.robot.mjcf import model_bytes
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import loss_of
@@ -68,12 +67,9 @@ def walker_hash(robot: Robot) -> str:
     What only begins or judges one may change: weights, loss, limits of a fall, plants.
     """
     d = robot.description
-    feet = tuple(map(tuple, d.feet))
     control = [section for section in d.control if section[0] != "twin"]
-    parts = d.standing, d.joints, d.linkage, d.weld, d.armature, feet, tuple(control)
-    limits = (d.range, d.torque) if d.range or d.torque else ()
-    text = repr((*parts, *limits)).encode()
-    return hashlib.sha256(text + model_bytes(d.model)).hexdigest()[:16]
+    text = repr((d.standing, d.joints, d.linkage, tuple(map(tuple, d.feet)), control)).encode()
+    return hashlib.sha256(text + d.model.read_bytes()).hexdigest()[:16]
 
 
 def walk_card(

@@ -1,48 +1,144 @@
-"""Check the feet and the standing pose of a robot in the standard form (see `source`).
+"""Check that a model has the standard form, that all later code reads, and that it can stand.
 
-Feet touch the floor at one, two or four spheres about a point; the standing pose is on the floor,
-in balance and within the limits of joints and motors.
+The standard form has a trunk with a free joint, whose frame has x ahead and z up; one body per leg
+joint, leg by leg from the trunk down, with the joint in its origin; torque motors in that order; a
+floor; one, two or four spheres about a point, a site, on the sole of each foot; and a keyframe of
+the standing pose, on the floor, in balance and within the limits of joints and motors.
+
+Contact bits: 1 floor, 2 first leg, 4 second leg, and so on. Soles touch the floor with their
+spheres only; trunk and legs collide with the floor, so that falls are detected, and the legs with
+each other. Friction and stiffness are those of the floor.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import InputError, did_you_mean
+from hector_jax.core.inputs import InputError, expect, listed, require
 from hector_jax.core.trajectory import FEET
-from hector_jax.robot.description import Description
+from hector_jax.robot.description import Description, convert_by
+from hector_jax.robot.mjcf import TIME_STEP
+from hector_jax.robot.poses import standing_data, trunk_body
 
 _TOLERANCE = 1e-4  # [m]: between the contacts of different feet; angles in files have few digits
-ON_FLOOR = 1e-3  # [m]: largest distance of a sole from the floor
+_ON_FLOOR = 1e-3  # [m]: largest distance of a sole from the floor
 _OVER_FEET = 5e-3  # [m]: of the centre of mass outside the contacts; a point spans no length
+_MOST_FRICTION = 0.2  # of the robot's geoms; MuJoCo takes the larger friction of two geoms
+SHAPES = tuple(range(int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_BOX) + 1))
+SOLVER = {
+    "timestep": TIME_STEP,
+    "integrator": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "solver": mujoco.mjtSolver.mjSOL_NEWTON,
+    "cone": mujoco.mjtCone.mjCONE_PYRAMIDAL,
+    "iterations": 10,
+    "ls_iterations": 10,
+}
+"""The options of every robot, by name in MuJoCo."""
 
 
-def check_model(description: Description, model: mujoco.MjModel) -> None:
-    """Check a model that `source.build_spec` has converted to the standard form.
+def check_form(description: Description, model: mujoco.MjModel) -> None:
+    """Check that a compiled model has the standard form, with the names of a description.
 
     Raises:
-        InputError: one line with the value received, the expected one and the possible names.
+        InputError: one line with a name that it has not and the possible ones; or what it has not
+            of the form, and the command that converts it.
     """
-    path = description.model
-    sites = [model.site(i).name for i in range(model.nsite)]
-    geoms = [model.geom(i).name for i in range(model.ngeom)]
-    last_joints = description.joints[description.leg_joints - 1 :: description.leg_joints]
-    for foot, joint in zip(description.named_feet, last_joints, strict=True):
-        require(path, "site", foot.point, sites)
-        body = model.joint(joint).bodyid[0]
-        name = model.body(body).name
-        on_foot = model.site(foot.point).bodyid[0] == body
-        expect(path, on_foot, f"site {foot.point!r} is not on the foot, body {name!r}")
-        for contact in foot.contacts:
-            require(path, "geom", contact, geoms)
-            geom = model.geom(contact)
-            valid = geom.bodyid[0] == body and geom.type[0] == mujoco.mjtGeom.mjGEOM_SPHERE
-            expect(path, valid, f"geom {contact!r} is not a sphere on body {name!r}")
-    _check_standing(description, model)
+    path, remedy = description.model, f"; {convert_by(description.path)}"
+    for kind, names, part, count in (
+        ("keyframe", [description.standing], model.key, model.nkey),
+        ("joint", description.joints, model.joint, model.njnt),
+        ("site", [foot.point for foot in description.feet], model.site, model.nsite),
+        ("geom", sum((foot.contacts for foot in description.feet), ()), model.geom, model.ngeom),
+    ):
+        known = [part(i).name for i in range(count)]
+        for name in names:
+            require(path, kind, name, known, remedy)
+    for text in (*_not_of_robot(description, model), *_not_of_world(description, model)):
+        raise InputError(f"{path}: not in the standard form: {text}{remedy}")
+
+
+def _not_of_robot(description: Description, model: mujoco.MjModel) -> Iterator[str]:
+    """Yield what bodies, joints and motors have not of the standard form."""
+    names, kinds = [model.joint(j).name for j in range(model.njnt)], mujoco.mjtJoint
+    free = np.flatnonzero(model.jnt_type == kinds.mjJNT_FREE)
+    if [*free] != [0] or tuple(names[1:]) != description.joints:
+        yield f"joints are {listed(names)}, expected a free one, then {listed(description.joints)}"
+        return
+    count, hinges = description.leg_joints, np.arange(1, model.njnt)
+    above = np.where((hinges - 1) % count == 0, 1, hinges)  # the trunk, or the body before
+    bodies = [*model.jnt_bodyid] == [*range(1, model.nbody)]
+    if not (bodies and np.array_equal(model.body_parentid[2:], above)):
+        yield "expected a body for each joint and no other, leg by leg from the trunk down"
+        return
+    if np.any(model.jnt_type[1:] != kinds.mjJNT_HINGE) or not np.all(model.jnt_limited[1:]):
+        yield "expected hinges with a range"
+    if np.any(model.jnt_pos) or np.any(model.qpos0[7:]):
+        yield "expected each joint in the origin of its body, and no ref"
+    span, force = model.actuator_ctrlrange, model.actuator_forcerange
+    motor = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE)
+    own = model.actuator_gaintype, model.actuator_biastype, model.actuator_dyntype
+    if not (
+        np.array_equal(model.actuator_trnid[:, 0], hinges)
+        and np.all(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+        and np.all(np.transpose(own) == motor)
+        and np.all(model.actuator_gainprm[:, 0] == 1.0)
+        and np.all(model.actuator_gear[:, 0] == 1.0)
+        and np.all(model.actuator_ctrllimited)
+        and np.array_equal(span[:, 0], -span[:, 1])
+        and np.all((force == span) | (model.actuator_forcelimited[:, None] == 0))
+    ):
+        yield "expected a motor of torque for each joint in their order, with a ctrlrange"
+    last_bodies = model.jnt_bodyid[count::count]
+    for foot, body in zip(description.feet, last_bodies, strict=True):
+        contacts = [model.geom(name) for name in foot.contacts]
+        spheres = all(x.type[0] == mujoco.mjtGeom.mjGEOM_SPHERE for x in contacts)
+        if {body} != {
+            part.bodyid[0] for part in (model.site(foot.point), *contacts)
+        } or not spheres:
+            parts = listed((foot.point, *foot.contacts))
+            yield f"expected a site and spheres on body {model.body(body).name!r}, got {parts}"
+
+
+def _not_of_world(description: Description, model: mujoco.MjModel) -> Iterator[str]:
+    """Yield what floor, contacts and options have not of the standard form."""
+    collide = (model.geom_contype | model.geom_conaffinity) > 0
+    floor = np.flatnonzero(collide & (model.geom_bodyid == 0))
+    bits = [(model.geom_contype[g], model.geom_conaffinity[g], model.geom_type[g]) for g in floor]
+    level = not np.any(model.geom_pos[floor]) and not np.any(model.geom_quat[floor, 1:3])
+    if bits != [(1, 0, mujoco.mjtGeom.mjGEOM_PLANE)] or not level:
+        yield "expected one floor that collides, a plane at z = 0 with contype 1, conaffinity 0"
+    contacts = {name for foot in description.feet for name in foot.contacts}
+    for g in map(int, np.flatnonzero(collide & (model.geom_bodyid > 0))):
+        link = int(model.geom_bodyid[g]) - 1
+        leg = (link - 1) // description.leg_joints if link else None
+        contype, conaffinity = contact_bits(len(description.feet), leg)
+        if (
+            model.geom_contype[g] & ~contype
+            or model.geom_conaffinity[g] & ~conaffinity
+            or model.geom_solmix[g]
+            or model.geom_priority[g]
+            or model.geom_condim[g] != (3 if model.geom(g).name in contacts else 1)
+            or model.geom_friction[g, 0] > _MOST_FRICTION
+            or model.geom_type[g] not in SHAPES
+        ):
+            yield f"contact bits or friction of geom {model.geom(g).name!r}"
+    for name, value in SOLVER.items():
+        if (own := getattr(model.opt, name)) != value:
+            yield f"option {name} is {own}, expected {float(value):g}"
+    gravity = model.opt.gravity
+    if np.any(gravity[:2]) or not gravity[2] < 0.0:
+        yield f"gravity is {gravity}, expected 0 0 and a negative number"
+
+
+def contact_bits(legs: int, leg: int | None, *, on_floor: bool = True) -> tuple[int, int]:
+    """Return contype and conaffinity of a leg, or of the trunk (None), by the number of legs."""
+    if leg is None:
+        return 0, 1
+    others = sum(2 << i for i in range(legs) if i != leg)
+    return 2 << leg, others + on_floor
 
 
 def check_soles(path: Path, contacts: Float[np.ndarray, "feet c 3"]) -> None:
@@ -75,31 +171,37 @@ def check_soles(path: Path, contacts: Float[np.ndarray, "feet c 3"]) -> None:
         expect(path, same, f"{text}, expected the same")
 
 
-def _check_standing(description: Description, model: mujoco.MjModel) -> None:
-    """Check that the standing pose is on the floor, balanced, within limits and can be held."""
+def check_standing(description: Description, model: mujoco.MjModel) -> None:
+    """Check that the standing pose is on the floor, balanced, within limits and can be held.
+
+    Raises:
+        InputError: one line with the value received and the expected one.
+    """
     path, data = description.model, standing_data(description, model)
-    key = f"keyframe {description.standing_key!r}"
+    key = f"keyframe {description.standing!r}"
     for name in description.joints:
         angle, limits = data.joint(name).qpos[0], model.joint(name).range
-        text = f"{key} has joint {name!r} at {angle:.4g}, expected it in its range {limits}"
-        expect(path, limits[0] <= angle <= limits[1], text)
-    feet, legs = description.named_feet, description.legs
+        if not limits[0] <= angle <= limits[1]:
+            text = f"{key} has joint {name!r} at {angle:.4g}, expected it in its range {limits}"
+            raise InputError(f"{path}: {text}")
+    feet, legs = description.feet, description.legs
     spheres = [name for foot in feet for name in foot.contacts]
-    heights = lowest_points(data, spheres)
-    low, angles = min(heights), not isinstance(description.standing, str)
-    for name, height in zip(spheres, heights, strict=True):
-        text = f"{key} has the sole at geom {name!r} {height:.4g} m above the floor, expected 0"
-        expect(path, angles or abs(height) <= ON_FLOOR, text)
+    heights = [data.geom(x).xpos[2] - model.geom(x).size[0] for x in spheres]
+    low = min(heights)
     offsets = (f"{name} {1e3 * (h - low):.1f}" for name, h in zip(spheres, heights, strict=True))
     text = "standing, the soles are not level: contacts above the lowest one [mm]: "
-    text += f"{', '.join(offsets)}; expected at most {1e3 * ON_FLOOR:g}: change the standing angles"
-    expect(path, max(heights) - low <= ON_FLOOR, text)
+    text += (
+        f"{', '.join(offsets)}; expected at most {1e3 * _ON_FLOOR:g}: change the standing angles"
+    )
+    expect(path, max(heights) - low <= _ON_FLOOR, text)
+    text = f"{key} has the soles {low:.4g} m above the floor; {convert_by(description.path)}"
+    expect(path, abs(low) <= _ON_FLOOR, text)
     for contact in data.contact:
         bodies = model.geom_bodyid[contact.geom]
         sole = any(model.geom(g).name in spheres for g in contact.geom)
         text = f"{key} has body {model.body(bodies.max()).name!r} {-contact.dist:.3g} m below the "
         text += "floor, expected nothing there but soles: change the standing angles or the shape"
-        expect(path, sole or bodies.min() or contact.dist > -ON_FLOOR, text)
+        expect(path, sole or bodies.min() or contact.dist > -_ON_FLOOR, text)
     x, y, _ = np.array([data.site(foot.point).xpos for foot in feet]).T
     pairs = [(i, i + 1, "y", y, "left") for i in range(0, len(feet), 2)]
     for i, j, axis, at, word in pairs + [(i, i + 2, "x", x, "ahead") for i in range(len(feet) - 2)]:
@@ -116,7 +218,7 @@ def _check_standing(description: Description, model: mujoco.MjModel) -> None:
 
 def _check_load(description: Description, data: mujoco.MjData) -> None:
     """Check that each motor can hold its joint in the standing pose, the feet sharing the load."""
-    model, trunk, feet = data.model, trunk_body(data.model), description.named_feet
+    model, trunk, feet = data.model, trunk_body(data.model), description.feet
     com, torques = data.subtree_com[trunk], data.qfrc_bias - data.qfrc_passive  # of springs
     force = -model.opt.gravity * model.body_subtreemass[trunk] / len(feet)
     for foot in feet:
@@ -130,39 +232,3 @@ def _check_load(description: Description, data: mujoco.MjData) -> None:
         torque, limit = torques[6 + index], model.actuator(index).ctrlrange[1]
         text = f"standing takes {abs(torque):.3g} N m of joint {name!r}, which has {limit:g}"
         expect(description.model, abs(torque) <= limit, text)
-
-
-def expect(path: Path, condition: Any, message: str) -> None:
-    """Raise InputError `path: message` unless the condition holds."""
-    if not condition:
-        raise InputError(f"{path}: {message}")
-
-
-def standing_data(description: Description, model: mujoco.MjModel) -> mujoco.MjData:
-    """Return the kinematics and dynamics of a model in the standing pose."""
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, model.key(description.standing_key).id)
-    mujoco.mj_forward(model, data)
-    return data
-
-
-def trunk_body(model: mujoco.MjModel) -> int:
-    """Return the body that the free joint moves."""
-    return int(model.jnt_bodyid[0])
-
-
-def lowest_points(data: mujoco.MjData, spheres: Sequence[str]) -> list[float]:
-    """Return the height of the lowest point of each sphere [m]."""
-    return [float(data.geom(s).xpos[2] - data.model.geom(s).size[0]) for s in spheres]
-
-
-def require(path: Path, kind: str, name: str, names: Sequence[str]) -> None:
-    """Raise InputError with the nearest name unless the name is one of the names."""
-    if name not in names:  # the nearest name takes longer to find than all other checks
-        text = f"no {kind} {name!r}{did_you_mean(name, names)}; {kind}s: {listed(names)}"
-        raise InputError(f"{path}: {text}")
-
-
-def listed(names: Sequence[str]) -> str:
-    """Return the names that are not empty, joined by commas, or "none"."""
-    return ", ".join(filter(None, names)) or "none"

@@ -1,18 +1,14 @@
 """The TOML file with names, limits, gait and weights that accompanies a robot's model.
 
     name = "strider"                   # its walks and net are stored under this name
-    model = "strider.xml"              # MJCF or URDF, beside this file
-    standing = "home"                  # keyframe of the standing pose, or angles: { knee = 0.5 }
+    model = "strider.xml"              # MJCF in the standard form (`checks`), beside this file
+    standing = "standing"              # keyframe of the standing pose
     [joints]                           # of each leg, from the trunk down
     left, right = three to seven names each; of four legs: front_left, front_right, hind_left, ..
     linkage = [5, 4]                   # the fifth joint's motor also turns the fourth; optional
-    weld = ["waist"]                   # hinges that are fixed in the standing pose
-    armature = one number per joint    # [kg m^2] of a leg's motors, which a URDF cannot state
-    range, torque = [lower, upper] and a number per joint  # [rad], [N m] where the model has none
-    [feet]                             # per leg: names in the model, or points in a body's frame
-    left, right = { point = site on the sole, toe = geom, heel = geom }
-    left, right = { point = site, contacts = [geom, ...] }                   # 1, 2 or 4 contacts
-    left, right = { body, contacts = [[x, y, z], ...], point = [x, y, z] }   # as many
+    [feet]                             # by leg: names of a site on the sole and of spheres
+    left, right = { point = site, toe = sphere, heel = sphere }
+    left, right = { point = site, contacts = [sphere, ...] }                 # 1, 2 or 4 contacts
     [limits]
     min_height, max_tilt               # [m] of the centre of mass, [rad]: beyond them it has fallen
     [gait] [mpc] [slip] [footstep] [legs] [twin]  # fields of GaitConfig, MpcConfig and so on
@@ -22,13 +18,13 @@
     [tuning] [plants]                  # fields of TuningSettings, PlantSizes
     [numbers.NAME]                     # of a user's controller: fields of Number
 
-The model must be named; all other defaults are those of assets/hector.toml,
-but without [slip] the controller does not react to slips. Masses, lengths, joint
-and torque limits come from the model; a description is a static field of its `Robot` under jit.
+The model must be named; all other defaults are those of assets/hector.toml, but without [slip] the
+controller does not react to slips. Masses, lengths, joint and torque limits come from the model; a
+description is a static field of its `Robot` under jit. Published robots have more keys
+(`importing.draft`), with which `hector robot` brings them into this form.
 """
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -37,7 +33,7 @@ import jax
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import NOT_NEGATIVE, POSITIVE, check, from_table, read_toml
 from hector_jax.core.trajectory import FEET, MAX_TILT, MIN_HEIGHT
-from hector_jax.robot.numbers import Number, read_numbers
+from hector_jax.robot.numbers import Number
 
 _PACKAGE = Path(__file__).parents[1]
 _INSTALLED = _PACKAGE / "assets"  # the folder in a wheel
@@ -45,7 +41,6 @@ _ASSETS = _INSTALLED if _INSTALLED.exists() else _PACKAGE.parent / "assets"
 MODEL_PATH = _ASSETS / "hector.xml"
 DESCRIPTION_PATH = _ASSETS / "hector.toml"
 
-LEG_JOINTS = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle")
 FEWEST_JOINTS, MOST_JOINTS = 3, 7  # of a leg
 CONTROL = ("gait", "mpc", "slip", "footstep", "legs", "twin")  # sections that the controller reads
 
@@ -54,22 +49,10 @@ MAX_BYTES = 100_000
 Triple = tuple[float, float, float]
 
 
-def _joint_names(side: str) -> tuple[str, ...]:
-    return tuple(f"{side}_{joint}" for joint in LEG_JOINTS)
-
-
 class Foot(NamedTuple):
-    """A foot in the model's file, by names in it or by points in the frame of a body."""
+    """A foot by names in the model."""
 
-    point: str | Triple | None  # site; or point where wrenches act [m]; None: middle of contacts
-    contacts: tuple[str | Triple, ...]  # spheres; or contact points of the sole [m]
-    body: str | None = None  # whose frame the points are in
-
-
-class NamedFoot(NamedTuple):
-    """A foot in the compiled model, where site and spheres have names."""
-
-    point: str  # site
+    point: str  # site where wrenches act
     contacts: tuple[str, ...]  # spheres
 
 
@@ -106,21 +89,15 @@ class TuningSettings:
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Description:
-    """The content of a robot's TOML; the defaults are the names and limits of HECTOR."""
+    """The content of a robot's TOML."""
 
-    model: Path = MODEL_PATH  # MJCF or URDF
-    path: Path = DESCRIPTION_PATH  # of the TOML
-    name: str = "hector"
-    standing: str | tuple[tuple[str, float], ...] = "standing"  # keyframe, or angles [rad] by joint
-    joints: tuple[str, ...] = _joint_names("left") + _joint_names("right")
-    linkage: tuple[int, int] | None = (5, 4)  # motor, and joint it also turns; counted from 1
-    weld: tuple[str, ...] = ()  # joints
-    armature: tuple[float, ...] = ()  # [kg m^2] of the joints of a leg; empty: the model's
-    range: tuple[tuple[float, float], ...] = ()  # [rad] of those of a leg without one in the model
-    torque: tuple[float, ...] = ()  # [N m] limits of those of a leg without one in the model
-    feet: tuple[Foot, ...] = tuple(
-        Foot(f"{side}_foot_point", (f"{side}_toe", f"{side}_heel")) for side in FEET[2]
-    )
+    model: Path  # MJCF
+    path: Path  # of the TOML
+    name: str
+    standing: str  # keyframe
+    joints: tuple[str, ...]  # leg by leg
+    linkage: tuple[int, int] | None  # motor, and joint it also turns; counted from 1
+    feet: tuple[Foot, ...]  # in the order of FEET
     min_height: float = MIN_HEIGHT  # [m] of the centre of mass; below it the robot has fallen
     max_tilt: float = MAX_TILT  # [rad] of roll or pitch; beyond it the robot has fallen
     control: tuple[tuple[str, tuple[tuple[str, Any], ...]], ...] = ()  # unchecked sections
@@ -140,43 +117,14 @@ class Description:
         return self.min_height, self.max_tilt
 
     @property
-    def standing_key(self) -> str:
-        """Keyframe of the standing pose in the compiled model."""
-        return self.standing if isinstance(self.standing, str) else "standing"
-
-    @property
     def legs(self) -> tuple[str, ...]:
         """Names of the legs."""
         return FEET[len(self.feet)]
 
     @property
-    def named_feet(self) -> tuple[NamedFoot, ...]:
-        """Site and spheres of each foot in the compiled model."""
-        return tuple(
-            NamedFoot(f"{leg}_point", tuple(f"{leg}_contact_{i}" for i in range(len(contacts))))
-            if body is not None
-            else NamedFoot(str(point), tuple(map(str, contacts)))
-            for leg, (point, contacts, body) in zip(self.legs, self.feet, strict=True)
-        )
-
-    @property
     def leg_joints(self) -> int:
         """Number of joints of a leg."""
         return len(self.joints) // len(self.feet)
-
-
-def _by_leg(section: Any, default: Any) -> dict[str, Any]:
-    """Return the values of a section that are not the default, by leg in the order of FEET.
-
-    Raises:
-        InputError: the section has too few or too many legs.
-    """
-    legs = sum(FEET.values(), ())
-    values = {leg: value for leg in legs if (value := getattr(section, leg)) != default}
-    if tuple(values) not in FEET.values():
-        expected = "; or ".join(map(", ".join, FEET.values()))
-        raise InputError(f"must have {expected}, got {', '.join(values) or 'none of them'}")
-    return values
 
 
 @dataclass(frozen=True)
@@ -190,18 +138,18 @@ class Joints:
     hind_left: tuple[str, ...] = ()
     hind_right: tuple[str, ...] = ()
     linkage: tuple[int, int] | None = None
-    weld: tuple[str, ...] = ()
-    armature: Annotated[tuple[float, ...], NOT_NEGATIVE] = ()
-    range: tuple[tuple[float, float], ...] = ()
-    torque: Annotated[tuple[float, ...], POSITIVE] = ()
 
     @property
     def legs(self) -> dict[str, tuple[str, ...]]:
-        """Joints by leg."""
-        return _by_leg(self, ())
+        """Joints by leg, in the order of FEET."""
+        legs = sum(FEET.values(), ())
+        return {leg: joints for leg in legs if (joints := getattr(self, leg))}
 
     def __post_init__(self) -> None:
-        names = sum(self.legs.values(), self.weld)
+        if tuple(self.legs) not in FEET.values():
+            expected = "; or ".join(map(", ".join, FEET.values()))
+            raise InputError(f"must have {expected}, got {', '.join(self.legs) or 'none of them'}")
+        names = sum(self.legs.values(), ())
         counts = [len(joints) for joints in self.legs.values()]
         count = counts[0]
         if not FEWEST_JOINTS <= count <= MOST_JOINTS or set(counts) != {count}:
@@ -212,12 +160,6 @@ class Joints:
         if len(set(names)) < len(names):
             duplicate = next(name for name in names if names.count(name) > 1)
             raise InputError(f"must be different names, got {short_repr(duplicate)} twice")
-        for name in ("armature", "range", "torque"):
-            if len(value := getattr(self, name)) not in (0, count):
-                text = f"{name} must be {'a pair' if name == 'range' else 'a number'} for each of "
-                raise InputError(f"{text}the {count} joints of a leg, got {short_repr(value)}")
-        if any(not low < high for low, high in self.range):
-            raise InputError(f"range must rise, got {short_repr(self.range)}")
         if self.linkage and (
             not all(1 <= i <= count for i in self.linkage) or len(set(self.linkage)) < 2
         ):
@@ -226,55 +168,49 @@ class Joints:
 
 
 @dataclass(frozen=True)
-class _Foot:
-    point: str | Triple | None = None
+class NamedFoot:
+    """A foot in the section [feet]."""
+
+    point: str
+    contacts: tuple[str, ...] = ()
     toe: str | None = None
     heel: str | None = None
-    body: str | None = None
-    contacts: tuple[str | Triple, ...] = ()
-
-    def __post_init__(self) -> None:
-        point, contacts, body = self.foot
-        named = [isinstance(x, str) for x in contacts]
-        valid = len(contacts) in (1, 2, 4) and not (self.contacts and (self.toe or self.heel))
-        if body is None:
-            valid = valid and all(named) and isinstance(point, str)
-        else:
-            points = [*contacts, (0.0, 0.0, 0.0) if point is None else point]
-            valid = valid and not any(named) and not isinstance(point, str)
-            valid = valid and all(math.isfinite(float(x)) for at in points for x in at)
-        if not valid:
-            raise InputError(
-                "must be names: point (a site) and toe and heel (spheres), or point and 1, 2 or 4 "
-                "contacts (spheres); or a body with 1, 2 or 4 contacts [x, y, z] on its sole and, "
-                "if wanted, a point [x, y, z]"
-            )
 
     @property
-    def foot(self) -> Foot:
-        """The foot in the form of the description."""
-        ends = () if self.toe is None or self.heel is None else (self.toe, self.heel)
-        return Foot(self.point, ends or self.contacts, self.body)
+    def places(self) -> tuple[str, ...]:
+        """Its contacts, of which toe and heel are two."""
+        return self.contacts or tuple(x for x in (self.toe, self.heel) if x is not None)
+
+    def __post_init__(self) -> None:
+        both = self.contacts and (self.toe is not None or self.heel is not None)
+        if both or len(self.places) not in (1, 2, 4):
+            raise InputError(
+                "must be names: point (a site) and toe and heel (spheres), or point and 1, 2 or 4 "
+                "contacts (spheres)"
+            )
 
 
 @dataclass(frozen=True)
-class _Feet:
-    left: _Foot | None = None
-    right: _Foot | None = None
-    front_left: _Foot | None = None
-    front_right: _Foot | None = None
-    hind_left: _Foot | None = None
-    hind_right: _Foot | None = None
+class Names:
+    """The part of a file that names what its model has."""
+
+    joints: Joints
+    feet: dict[str, NamedFoot]
+    standing: str
 
     @property
-    def feet(self) -> dict[str, Foot]:
-        """Feet by leg."""
-        return {leg: foot.foot for leg, foot in _by_leg(self, None).items()}
+    def all_joints(self) -> tuple[str, ...]:
+        """Joints, leg by leg."""
+        return sum(self.joints.legs.values(), ())
 
     def __post_init__(self) -> None:
-        counts = [len(foot.contacts) for foot in self.feet.values()]
+        legs = self.joints.legs
+        if {*self.feet} != {*legs}:
+            text = f"joints has the legs {', '.join(legs)}, expected them in feet"
+            raise InputError(f"{text}, got {', '.join(self.feet)}")
+        counts = [len(self.feet[leg].places) for leg in legs]
         if len(set(counts)) > 1:
-            raise InputError(f"{' and '.join(self.feet)} must have as many contacts, got {counts}")
+            raise InputError(f"{' and '.join(legs)} must have as many contacts, got {counts}")
 
 
 @dataclass(frozen=True)
@@ -310,9 +246,6 @@ class _Weights:
 class _File:
     name: str | None = None
     model: str = ""
-    standing: str | dict[str, float] = "standing"
-    joints: Joints = Joints(left=_joint_names("left"), right=_joint_names("right"))
-    feet: _Feet | None = None
     limits: _Limits = _Limits()
     gait: dict | None = None
     mpc: dict | None = None
@@ -324,21 +257,30 @@ class _File:
     loss: dict[str, float] | None = None
     tuning: TuningSettings = TuningSettings()
     plants: PlantSizes = PlantSizes()
-    numbers: dict[str, dict] | None = None
+    numbers: dict[str, Number] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        legs, feet = tuple(self.joints.legs), self.feet and tuple(self.feet.feet)
-        if legs != (feet or FEET[2]):
-            got = f"{', '.join(feet)} in feet" if feet else "no [feet]"
-            text = f"joints has the legs {', '.join(legs)}, expected them in feet"
-            raise InputError(f"{text}, got {got}")
-        angles = self.standing.values() if isinstance(self.standing, dict) else ()
-        if not all(map(math.isfinite, angles)):
-            raise InputError(f"standing must be finite angles, got {short_repr(self.standing)}")
-        if not self.model:
-            raise InputError("model is missing: the name of an MJCF or URDF beside this file")
-        if Path(self.model).name != self.model:
-            raise InputError(f"model must name a file beside it, got {short_repr(self.model)}")
+
+def model_name(path: Path, table: dict[str, Any]) -> str:
+    """Return the name of the model in the table of a TOML file.
+
+    Raises:
+        InputError: it is missing, or not in the folder of the TOML file.
+    """
+    name = table.get("model")
+    if not isinstance(name, str) or not name:
+        raise InputError(f"{path}: model is missing: the name of an MJCF or URDF beside this file")
+    if Path(name).name != name:
+        text = f"model must name a file beside it, got {short_repr(name)}"
+        raise InputError(f"{path}: {text}")
+    return name
+
+
+_TABLE = read_toml(DESCRIPTION_PATH, "the robot description", MAX_BYTES)
+HECTOR_NAMES = {key: _TABLE[key] for key in ("joints", "feet", "standing")}
+HECTOR_NAMES["joints"] = {
+    leg: _TABLE["joints"][leg] for leg in FEET[2]
+}  # a linkage is HECTOR's own
+"""The part of HECTOR's table that a robot with its names may leave out."""
 
 
 def read_description(path: Path) -> Description:
@@ -360,24 +302,29 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
     Raises:
         InputError: as `read_description`.
     """
-    file = from_table(str(path), _File, table)
+    names = HECTOR_NAMES | {key: table[key] for key in HECTOR_NAMES if key in table}
+    try:
+        named = from_table(str(path), Names, names)
+    except InputError as error:
+        raise InputError(f"{error}; {convert_by(path)}") from None
+    others = {key: x for key, x in table.items() if key not in names}
+    file = from_table(str(path), _File, others)
     name = path.stem if file.name is None else file.name
     if not name.replace("-", "").replace("_", "").isalnum():
         text = "name must be letters, digits, - and _ (it names a folder)"
         raise InputError(f"{path}: {text}, got {short_repr(name)}")
+    if odd := [name for name in file.numbers if not name.isidentifier()]:
+        text = "the name of a number must be letters, digits and _"
+        raise InputError(f"{path}: numbers: {text}, got {short_repr(odd[0])}")
     sections = {name: getattr(file, name) for name in CONTROL}
     return Description(
-        model=path.parent / file.model,
+        model=path.parent / model_name(path, table),
         path=path,
         name=name,
-        standing=_as_tuples(file.standing),
-        joints=sum(file.joints.legs.values(), ()),
-        linkage=file.joints.linkage,
-        weld=file.joints.weld,
-        armature=file.joints.armature,
-        range=file.joints.range,
-        torque=file.joints.torque,
-        feet=tuple(file.feet.feet.values()) if file.feet else Description.feet,
+        standing=named.standing,
+        joints=named.all_joints,
+        linkage=named.joints.linkage,
+        feet=tuple(Foot(x.point, x.places) for x in (named.feet[leg] for leg in named.joints.legs)),
         **vars(file.limits),
         control=_as_tuples({name: x for name, x in sections.items() if x is not None}),
         nominal=file.weights.nominal and file.weights.nominal.rows(),
@@ -385,8 +332,13 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
         loss=_as_tuples(file.loss or {}),
         tuning=file.tuning,
         plants=file.plants,
-        numbers=read_numbers(str(path), file.numbers or {}),
+        numbers=tuple(file.numbers.items()),
     )
+
+
+def convert_by(path: Path) -> str:
+    """Return the words that name the command which brings a file into the standard form."""
+    return f"a robot as published is converted once, by hector robot {path} --out FOLDER"
 
 
 def _as_tuples(value: Any) -> Any:
@@ -396,5 +348,5 @@ def _as_tuples(value: Any) -> Any:
     return tuple(map(_as_tuples, value)) if isinstance(value, list | tuple) else value
 
 
-HECTOR = Description()
+HECTOR = description_of(DESCRIPTION_PATH, _TABLE)
 """The default robot, whose plants are drawn if no description is passed."""

@@ -1,34 +1,36 @@
-"""Check a robot's file of any origin before MuJoCo opens it.
+"""Check the model of a robot before MuJoCo opens it.
 
-A model is an MJCF or URDF file of at most 1 MB, which may include files that are beside or below
-it. Meshes and pictures are named in it but never opened (`elements` removes them). Elements that
-read other files or expand (entities, replicated and composed bodies, huge textures and memories)
-and numbers that no robot has (NaN, negative masses, empty ranges, turns in degrees where radians
-are due) are refused; the message names file, element, attribute and value. What a URDF draws only
-(visuals) is left out.
-Other modules check which bodies and joints a robot has.
+A model is an MJCF of at most 1 MB that names no other file. Elements that expand (entities,
+replicated and composed bodies, huge textures and memories) and numbers that no robot has (NaN,
+negative masses, empty ranges, turns in degrees where radians are due) are refused; the message
+names file, element, attribute and value. `checks` says which bodies and joints a robot has.
 """
 
+import math
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import product
 from pathlib import Path
 
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import InputError, did_you_mean, one_line, read_text, short_repr
+from hector_jax.core.inputs import (
+    InputError,
+    did_you_mean,
+    expect,
+    one_line,
+    read_text,
+    short_repr,
+)
 from hector_jax.core.settings import NOT_NEGATIVE, POSITIVE, Range
-from hector_jax.robot.checks import expect
+from hector_jax.robot.description import convert_by
 
 TIME_STEP = 0.001  # [s] of plant, joint control and samples of every robot
 MOST_BYTES = 1_000_000
 _DEEPEST = 100
 _MOST_BODIES, _MOST_JOINTS = 2000, 200
-_URDF_PARTS = ("link", "joint", "mujoco")  # of a robot; others are for other programs
-_LINK_PARTS = ("inertial", "collision")
 _TURN = 6.3  # [rad], rounded up
-_MOST_INCLUDES = 100  # files
 _REFUSED = ("attach", "model", "replicate", "composite", "flexcomp", "plugin")
 
 _COUNT = Range(-1, 1_000_000)  # -1: as many as needed
@@ -58,26 +60,52 @@ _MEMORY = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30}
 _MOST_MEMORY = 2**30
 
 
-def read_mjcf(path: Path) -> ElementTree.Element:
-    """Read the elements of an MJCF or URDF that is safe to open with MuJoCo.
+def read_mjcf(path: Path, toml: Path) -> ElementTree.Element:
+    """Read the elements of an MJCF that is safe to open with MuJoCo and needs no other file.
+
+    Args:
+        path: of the file.
+        toml: that names it.
 
     Raises:
         InputError: one line naming the file and the first error in it.
     """
-    root = _root(path)
-    if root.tag not in ("mujoco", "robot"):
-        raise InputError(f"{path}: root element is <{root.tag[:40]}>, expected <mujoco> or <robot>")
-    if root.tag == "robot":
-        root[:] = [part for part in root if part.tag in _URDF_PARTS]
-        for link in root.findall("link"):
-            link[:] = [part for part in link if part.tag in _LINK_PARTS]
-    else:
-        _include(path, root)
+    root = read_elements(path)
+    text = f"root element is <{root.tag[:40]}>, expected <mujoco>; {convert_by(toml)}"
+    expect(path, root.tag == "mujoco", text)
+    for element in root.iter():  # as <include file=..>
+        for file in (x for name, x in element.attrib.items() if name.startswith("file")):
+            text = f"<{element.tag}> of {short_repr(file)} is of another file"
+            raise InputError(f"{path}: {text}; {convert_by(toml)}")
+    check_elements(path, root)
+    return root
+
+
+def read_elements(path: Path) -> ElementTree.Element:
+    """Return the root element of a file.
+
+    Raises:
+        InputError: it cannot be read, or is no plain XML.
+    """
+    text = read_text(path, "the robot description", MOST_BYTES)
+    if match := re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
+        raise InputError(f"{path}: {match[1].upper()} is not accepted, expected plain MJCF or URDF")
+    try:
+        return ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise InputError(f"{path}: malformed XML: {one_line(error)}") from None
+
+
+def check_elements(path: Path, root: ElementTree.Element) -> None:
+    """Check all elements and numbers of an MJCF or URDF.
+
+    Raises:
+        InputError: one line naming the file and the first error in it.
+    """
     in_rad = root.tag == "robot" or any(x.get("angle") == "radian" for x in root.iter("compiler"))
     bodies = joints = 0
     for element, label in _labelled(path, root):
-        file = f" of {short_repr(element.get('file'))}" if "file" in element.attrib else ""
-        text = f"<{element.tag}>{file} is not accepted, expected plain bodies"
+        text = f"<{element.tag}> is not accepted, expected plain bodies"
         expect(path, element.tag not in _REFUSED, text)
         bodies += element.tag in ("body", "link")
         joints += element.tag in ("joint", "freejoint") and element.get("type") != "fixed"
@@ -88,48 +116,6 @@ def read_mjcf(path: Path) -> ElementTree.Element:
     expect(path, bodies <= _MOST_BODIES, f"{bodies} bodies, expected at most {_MOST_BODIES}")
     text = f"{joints} joints that move, expected at most {_MOST_JOINTS}: fix those of no leg"
     expect(path, joints <= _MOST_JOINTS, text)
-    return root
-
-
-def _root(path: Path) -> ElementTree.Element:
-    """Return the root element of a file."""
-    text = read_text(path, "the robot description", MOST_BYTES)
-    if match := re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
-        raise InputError(f"{path}: {match[1].upper()} is not accepted, expected plain MJCF or URDF")
-    try:
-        return ElementTree.fromstring(text)
-    except (ElementTree.ParseError, ValueError) as error:
-        raise InputError(f"{path}: malformed XML: {one_line(error)}") from None
-
-
-def model_bytes(path: Path) -> bytes:
-    """Return the bytes of a model's file, and of those that it includes."""
-    content = path.read_bytes()
-    if b"<include" not in content:
-        return content
-    files = _include(path, _root(path))
-    return b"".join([content, *(file.read_bytes() for file in files)])
-
-
-def _include(path: Path, root: ElementTree.Element) -> list[Path]:
-    """Put the content of the files that an MJCF includes into it; they may be beside or below it.
-
-    As in MuJoCo, each file can be included once, and its name is relative to the model. Returns the
-    files.
-    """
-    folder, seen = path.parent.resolve(), [path.resolve()]
-    while found := [(p, x) for p in root.iter() for x in p if x.tag == "include"]:
-        for parent, element in found:
-            name = element.get("file", "")
-            file = (folder / name).resolve()
-            text = f"<include> of {short_repr(name)} is not accepted, expected a file beside the "
-            text += "model, or below it, that is included once"
-            expect(path, file.is_relative_to(folder) and file.is_file() and file not in seen, text)
-            expect(path, len(seen) <= _MOST_INCLUDES, f"more than {_MOST_INCLUDES} includes")
-            seen.append(file)
-            i = list(parent).index(element)
-            parent[i : i + 1] = list(_root(file))
-    return seen[1:]
 
 
 @contextmanager
@@ -182,15 +168,17 @@ def _expected(tag: str, name: str, value: str, in_rad: bool) -> str | None:
     """Return what was expected of an attribute with an invalid value, None for a valid one."""
     if name == "name" or tag == "flag":  # a flag's attributes are words, as "enable"
         return None
-    numbers = _numbers(value)
     if name == "memory":
         size = re.fullmatch(r"(\d{1,12})([KMG]?)", value)
         valid = value == "-1" or (size and int(size[1]) * _MEMORY[size[2]] <= _MOST_MEMORY)
         return None if valid else "at most 1G"
+    numbers: list[float] | None = None
+    with suppress(ValueError):
+        numbers = list(map(float, value.split()))
     allowed = _RANGES_OF.get((tag, name)) or _RANGES.get(name)
     if allowed and not (numbers and all(number in allowed for number in numbers)):
         return f"numbers {allowed}"
-    if numbers and not all(number in Range() for number in numbers):
+    if numbers and not math.isfinite(sum(numbers)):
         return "finite numbers"
     if name in ("rpy", "euler") and in_rad and max(map(abs, numbers or [0.0])) > _TURN:
         return "rad, and these are degrees"
@@ -198,11 +186,3 @@ def _expected(tag: str, name: str, value: str, in_rad: bool) -> str | None:
     if pair and (numbers is None or len(numbers) != 2 or numbers[0] > numbers[1]):
         return "two numbers, the lower one first"
     return None
-
-
-def _numbers(text: str) -> list[float] | None:
-    """Return the numbers in a text, None if it contains anything else."""
-    try:
-        return [float(word) for word in text.split()]
-    except ValueError:
-        return None

@@ -6,9 +6,10 @@
 The trunk's frame is at the trunk body's origin, x ahead, y left, z up.
 """
 
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 from warnings import catch_warnings
@@ -20,10 +21,10 @@ from scipy.spatial.transform import Rotation
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, one_line
-from hector_jax.robot.checks import check_model, check_soles, standing_data, trunk_body
-from hector_jax.robot.description import DESCRIPTION_PATH, Description, read_description
-from hector_jax.robot.links import data_at, inertia_about
-from hector_jax.robot.source import build_spec
+from hector_jax.robot.checks import check_form, check_soles, check_standing
+from hector_jax.robot.description import HECTOR, Description, convert_by, read_description
+from hector_jax.robot.mjcf import mujoco_errors, read_mjcf, text_of
+from hector_jax.robot.poses import data_at, inertia_about, standing_data, trunk_body
 
 _CLOSED_AXES = np.eye(3)[[2, 0, 1, 1, 1]]  # yaw, roll, hip pitch, knee, ankle
 _TOLERANCE = 1e-6  # [m], [-]: between values of a model that are equal but for rounding
@@ -102,32 +103,25 @@ def describe(path: Path | None = None) -> Description:
     """Read the description of a robot.
 
     Args:
-        path: TOML file, or MJCF file with HECTOR's names, which gets HECTOR's description; None
-            takes the packaged hector.toml.
+        path: TOML file; None takes the packaged hector.toml.
 
     Raises:
         InputError: as `read_description`.
     """
-    path = DESCRIPTION_PATH if path is None else Path(path)
-    if path.suffix == ".toml":
-        return read_description(path)
-    return replace(read_description(DESCRIPTION_PATH), model=path)
+    if path is None:
+        return HECTOR
+    if (path := Path(path)).suffix != ".toml":
+        raise InputError(f"{path}: expected the TOML file of a robot; {convert_by(path)}")
+    return read_description(path)
 
 
 def load_robot(path: Path | None = None) -> Robot:
     """Load the robot of a file accepted by `describe`.
 
     Raises:
-        InputError: as `describe` and `compile_model`.
+        InputError: as `describe` and `build_model`.
     """
-    description = describe(path)
-    try:
-        return robot_of(description)
-    except InputError as error:
-        if path is None or Path(path).suffix == ".toml":
-            raise
-        text = f"{error}; unless it is HECTOR's, propose its TOML file first: hector robot {path}"
-        raise InputError(text) from None
+    return robot_of(describe(path))
 
 
 def robot_of(description: Description, *, checked: bool = True) -> Robot:
@@ -146,7 +140,7 @@ def _constants(description: Description, model: mujoco.MjModel, checked: bool) -
     trunk = trunk_body(model)
     R_wb = data.xmat[trunk].reshape(3, 3)
     com = data.subtree_com[trunk]
-    points = np.array([data.site(foot.point).xpos for foot in description.named_feet])
+    points = np.array([data.site(foot.point).xpos for foot in description.feet])
     # in the standard form the first joint is the trunk's, and the others are those of the legs
     standing_joints, ranges = data.qpos[7:].copy(), model.jnt_range[1:]
     R, centers = data.ximat.reshape(-1, 3, 3), data.xipos
@@ -184,25 +178,49 @@ def _constants(description: Description, model: mujoco.MjModel, checked: bool) -
 
 
 def compile_model(description: Description) -> mujoco.MjModel:
-    """Return the compiled and checked model of a description; raises as `build_model`."""
-    return build_model(description)[1]
+    """Return the compiled and checked model of a description, with its pictures.
+
+    Raises:
+        InputError: as `build_model`.
+    """
+    build_model(description)
+    return _read_spec(description)[1].compile()
 
 
 def build_model(
     description: Description, *, checked: bool = True
 ) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
-    """Return the spec of a description, and its compiled model; unchecked, it need not stand.
+    """Return the spec of a description without pictures, which take half of the time to compile.
+
+    Args:
+        description: of the robot.
+        checked: whether it must stand.
+
+    Returns:
+        The spec; its compiled model.
 
     Raises:
         InputError: one line with the value received, the expected one and the possible names, from
-            `source.build_spec` or `checks.check_model`.
+            `mjcf.read_mjcf`, MuJoCo, `checks.check_form` or `checks.check_standing`.
     """
     with conversion(description.model):
-        spec = build_spec(description).spec
-        model = spec.compile()
+        root, spec = _read_spec(description)
+        for geom in spec.geoms:
+            geom.material = ""
+        for picture in (*spec.materials, *spec.textures):
+            spec.delete(picture)
+        with mujoco_errors(description.model, root):
+            model = spec.compile()
+        check_form(description, model)
         if checked:
-            check_model(description, model)
+            check_standing(description, model)
     return spec, model
+
+
+def _read_spec(description: Description) -> tuple[ElementTree.Element, mujoco.MjSpec]:
+    root = read_mjcf(description.model, description.path)
+    with mujoco_errors(description.model, root):
+        return root, mujoco.MjSpec.from_string(text_of(root))
 
 
 def _legs(
@@ -213,7 +231,7 @@ def _legs(
     Returns:
         Fields of `Robot`; centres of the contacts' spheres from the foot points [m]; radii [m].
     """
-    data, links, feet = data_at(model), model.jnt_bodyid[1:], description.named_feet
+    data, links, feet = data_at(model), model.jnt_bodyid[1:], description.feet
     anchor = data.xanchor[1:].reshape(len(feet), -1, 3)
     foot_point = np.array([data.site(foot.point).xpos for foot in feet]) - anchor[:, -1]
     spheres = [[model.geom(name).id for name in foot.contacts] for foot in feet]

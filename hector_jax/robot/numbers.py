@@ -4,12 +4,10 @@ They reach his programs with the weights. What uses a number tells how its slope
 of the planner if only the plan does, else by whole walks (`walk_tuning.moved`).
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
-from hector_jax.core.inputs import InputError, short_repr
-from hector_jax.core.settings import check, from_table
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import check
 
 
 @dataclass(frozen=True)
@@ -31,17 +29,3 @@ class Number:
         if not self.low <= self.start <= self.high:
             box = f"from {self.low:g} to {self.high:g}"
             raise InputError(f"start must be {box}, got {self.start:g}")
-
-
-def read_numbers(where: str, table: Mapping[str, Any]) -> tuple[tuple[str, Number], ...]:
-    """Return the numbers of a table by name.
-
-    Raises:
-        InputError: one line naming `where`, the number and what was expected.
-    """
-    for name in table:
-        if not name.isidentifier():
-            text = "the name of a number must be letters, digits and _"
-            raise InputError(f"{where}: numbers: {text}, got {short_repr(name)}")
-    read = {n: from_table(f"{where}: numbers: {n}", Number, one) for n, one in table.items()}
-    return tuple(read.items())

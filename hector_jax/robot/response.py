@@ -20,9 +20,9 @@ from scipy.linalg import null_space
 from scipy.optimize import root_scalar
 
 from hector_jax.core.headless import mujoco
-from hector_jax.robot.checks import standing_data
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot, build_model
+from hector_jax.robot.poses import standing_data
 
 DELAY, LAG = 0.005, 0.006  # [s] of the slowest motors that the gains are made for
 PHASE_MARGIN = np.deg2rad(20.0)  # of the loops with these motors
@@ -87,7 +87,7 @@ def response(robot: Robot, stance: Sequence[int] | None = None) -> Response:
     M = np.zeros((nv, nv))
     mujoco.mj_fullM(model, data, M)
     twists, points = np.zeros((feet, 6, nv)), np.zeros((feet, 3))
-    for foot, twist, point in zip(description.named_feet, twists, points, strict=True):
+    for foot, twist, point in zip(description.feet, twists, points, strict=True):
         site = model.site(foot.point).id
         mujoco.mj_jacSite(model, data, twist[:3], twist[3:], site)
         point[:] = data.site_xpos[site]

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
-from hector_jax.robot.links import rotation_of
 from hector_jax.robot.mjcf import TIME_STEP
+from hector_jax.robot.poses import rotation_of
 from hector_jax.sim.world import World
 
 

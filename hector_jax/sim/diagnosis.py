@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float
 from hector_jax.control.controller import WalkConfig
 from hector_jax.core.headless import mujoco
 from hector_jax.core.trajectory import SOLVED, Trajectory
-from hector_jax.robot.links import rotation_of
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
+from hector_jax.robot.poses import rotation_of
 from hector_jax.sim.loop import Job, first_tick, substeps
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
@@ -94,7 +94,7 @@ class Recorder:
             body: the plant's, see `Job.body`.
             most: number of milliseconds.
         """
-        self._robot, self._feet = robot, body.description.named_feet
+        self._robot, self._feet = robot, body.description.feet
         self._limits = robot.description.limits
         self._rows: deque[tuple] = deque(maxlen=most)
         self._touching: list[str] = []

@@ -19,9 +19,9 @@ from pydrake.multibody import tree
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from hector_jax.robot.links import rotation_of
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
+from hector_jax.robot.poses import rotation_of
 from hector_jax.sim import bodies
 from hector_jax.sim.bodies import Body
 from hector_jax.sim.loop import Job

@@ -18,9 +18,8 @@ from hector_jax.control.controller import Plan, WalkConfig
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
-from hector_jax.core.inputs import InputError
+from hector_jax.core.inputs import InputError, expect
 from hector_jax.core.trajectory import Belief, State, Trajectory, Wrench, has_fallen
-from hector_jax.robot.checks import expect
 from hector_jax.robot.description import Description
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot

@@ -19,7 +19,6 @@ from hector_jax.core.environment import code_hash
 from hector_jax.core.files import locked
 from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import ROBOT_DIGITS, load_tree, save_tree, tree_hash
-from hector_jax.robot.mjcf import model_bytes
 from hector_jax.robot.model import Robot
 
 Key = TypeVar("Key")
@@ -30,7 +29,7 @@ def robot_hash(robot: Robot) -> str:
     """Return a hash (16 hexadecimal digits) of a robot: its numbers, its TOML and its MJCF."""
     model = robot.description.model
     settings = replace(robot.description, path=Path(), model=Path(model.name))
-    text = f"{tree_hash(robot, ROBOT_DIGITS)} {settings!r} ".encode() + model_bytes(model)
+    text = f"{tree_hash(robot, ROBOT_DIGITS)} {settings!r} ".encode() + model.read_bytes()
     return hashlib.sha256(text).hexdigest()[:16]
 
 

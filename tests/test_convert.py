@@ -1,23 +1,24 @@
 """Robots as published, brought to one form: what is kept, what is fixed, what is refused."""
 
 import re
-from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
 from model import EXAMPLES
 from oracles import mass_matrix
-from published import HOLD, JOINTS, LINK, by_numbers, replaced, small, urdf_of
+from published import HOLD, JOINTS, LINK, by_numbers, converted, replaced, small, standard, urdf_of
 
-from hector_jax.robot.description import MODEL_PATH, Description, read_description
-from hector_jax.robot.source import build_spec
+from hector_jax import InputError, load_robot
+from hector_jax.robot.description import DESCRIPTION_PATH, MODEL_PATH, read_description
+from hector_jax.robot.model import compile_model, describe
 
 STRIDER = EXAMPLES / "strider" / "robot.toml"
+HECTOR = mujoco.MjModel.from_xml_path(str(MODEL_PATH))
 
 
-def compiled(description):
-    return build_spec(description).spec.compile()
+def compiled(given):
+    return mujoco.MjSpec.from_string(standard(given).text).compile()
 
 
 def standing(model):
@@ -27,41 +28,67 @@ def standing(model):
     return data
 
 
-def contacts_of(description):
-    return [name for foot in description.named_feet for name in foot.contacts]
+def contacts_of(model):
+    names = [model.geom(g).name for g in range(model.ngeom)]
+    return [name for name in names if "_contact_" in name]
 
 
 @pytest.mark.parametrize("path", [None, STRIDER])
 def test_a_model_that_has_the_form_is_left_bit_for_bit(path):
-    description = Description() if path is None else read_description(path)
-    source = build_spec(description)
+    description = describe(path)
     expected = mujoco.MjModel.from_xml_path(str(description.model))
-    assert source.notes == ()
     ours, theirs = (np.zeros(mujoco.mj_sizeModel(expected), np.uint8) for _ in range(2))
-    mujoco.mj_saveModel(source.spec.compile(), None, ours)
+    mujoco.mj_saveModel(compile_model(description), None, ours)
     mujoco.mj_saveModel(expected, None, theirs)
     assert ours.tobytes() == theirs.tobytes()
 
 
-def edited(folder, *changes):
-    (folder / "robot.xml").write_text(replaced(MODEL_PATH.read_text(), *changes))
-    return Description(model=folder / "robot.xml")
+NOT_STANDARD = {  # what is told of HECTOR's model with a change
+    "option cone is 1, expected 0": ('cone="pyramidal"', 'cone="elliptic"'),
+    "contact bits or friction of geom": ('friction="0.1 ', 'friction="0.9 '),
+    "expected a motor of torque for each": ('forcerange="-67 67"', 'gear="2"'),
+    "expected one floor": ('contype="1" conaffinity="0"', 'contype="1" conaffinity="1"'),
+    "expected each joint in the origin": (
+        'name="left_knee" class',
+        'name="left_knee" ref="1" class',
+    ),
+    "joints are base, wrist, left_hip_yaw, .* expected a free": (
+        '<body name="left_hip_yaw"',
+        '<body><joint name="wrist"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>'
+        r"\g<0>",
+    ),
+    "expected a body for each joint and no other": ('<body name="left_hip_yaw"', r"<body/>\g<0>"),
+}
 
 
-def test_solver_height_and_friction_are_mended_and_named_feet_stay(tmp_path):
-    expected = compiled(Description())
-    solver, height = ('cone="pyramidal"', 'cone="elliptic"'), ('qpos="0 0 0.548', 'qpos="0 0 0.648')
-    for changes, notes in (
-        ((solver, height), ["option cone set", "keyframe 'standing' lowered by 0.1 m to stand on"]),
-        ((('friction="0.1 ', 'friction="0.9 '),), ["contact bits, friction and shapes set"]),
+@pytest.mark.parametrize("words", NOT_STANDARD)
+def test_a_model_without_the_form_names_the_command_that_brings_it_there(tmp_path, words):
+    path = tmp_path / "own.toml"
+    path.write_text(DESCRIPTION_PATH.read_text())
+    model = replaced(MODEL_PATH.read_text(), NOT_STANDARD[words])
+    (tmp_path / "hector.xml").write_text(model)
+    command = f"converted once, by hector robot {path} --out FOLDER"
+    with pytest.raises(InputError, match=f"standard form: {words}.* {re.escape(command)}$"):
+        load_robot(path)
+    for other in (MODEL_PATH, EXAMPLES / "quadruped" / "quadruped.xml"):
+        with pytest.raises(InputError, match=f"hector robot {other} --out FOLDER$"):
+            load_robot(other)
+
+
+def test_solver_height_and_friction_are_mended_and_feet_may_have_names(tmp_path):
+    for change in (
+        ('cone="pyramidal"', 'cone="elliptic"'),
+        ('qpos="0 0 0.548', 'qpos="0 0 0.648'),
+        ('friction="0.1 ', 'friction="0.9 '),
     ):
-        description = edited(tmp_path, *changes)
-        source = build_spec(description)
-        got, names = source.spec.compile(), contacts_of(description)
-        for told, note in zip(source.notes, notes, strict=True):
-            assert told.startswith(note)
-        assert names == ["left_toe", "left_heel", "right_toe", "right_heel"]
-        assert all(got.geom(name).friction[0] == 0.1 for name in names)
+        text = replaced(MODEL_PATH.read_text(), change)
+        (tmp_path / "hector.xml").write_text(text)
+        (tmp_path / "own.toml").write_text(DESCRIPTION_PATH.read_text())
+        out = tmp_path / f"out{change[0][:4]}"
+        got = compile_model(read_description(converted(tmp_path / "own.toml", out)))
+        expected = HECTOR
+        assert len(contacts_of(got)) == 4
+        assert all(got.geom(name).friction[0] == 0.1 for name in contacts_of(got))
         assert got.opt.cone == expected.opt.cone
         np.testing.assert_allclose(got.site_pos, expected.site_pos, atol=1e-12)
         np.testing.assert_allclose(got.key_qpos, expected.key_qpos, atol=1e-6)
@@ -71,10 +98,9 @@ def test_solver_height_and_friction_are_mended_and_named_feet_stay(tmp_path):
 
 @pytest.mark.parametrize("world", [False, True])
 def test_a_urdf_is_the_robot_that_its_numbers_are(tmp_path, world):
-    hector = mujoco.MjModel.from_xml_path(str(MODEL_PATH))
-    source = build_spec(by_numbers(tmp_path, urdf_of(hector, world)))
-    model = source.spec.compile()
-    assert "a URDF" in " ".join(source.notes)
+    hector, given = HECTOR, by_numbers(tmp_path, urdf_of(HECTOR, world))
+    model = compiled(given)
+    assert "a URDF" in " ".join(standard(given).notes)
     assert (model.nq, model.nu, model.nmesh) == (17, 10, 0)
     np.testing.assert_allclose(model.actuator_ctrlrange, hector.actuator_ctrlrange)
     np.testing.assert_allclose(model.jnt_range, hector.jnt_range)
@@ -96,8 +122,8 @@ TURNED = {  # a body, and a joint that is not zero where the file draws it
 
 @pytest.mark.parametrize("legs", [{}, TURNED])
 def test_welded_and_jointless_bodies_are_part_of_the_trunk_and_the_feet(tmp_path, legs):
-    description = small(tmp_path, **legs)
-    model = compiled(description)
+    given = small(tmp_path, **legs)
+    model = compiled(given)
     names = [model.body(b).name for b in range(1, model.nbody)]
     assert names == ["base"] + [
         f"{s}_{part}" for s in ("left", "right") for part in ("hip", "thigh", "shin", "foot")
@@ -106,14 +132,14 @@ def test_welded_and_jointless_bodies_are_part_of_the_trunk_and_the_feet(tmp_path
     np.testing.assert_allclose(model.body("left_foot").mass, 0.21, rtol=1e-12)
     # the file as MuJoCo reads it, its hinges at the same angles
     spec = mujoco.MjSpec.from_string(
-        description.model.read_text()
+        given.model.read_text()
         .replace('<geom class="visual" mesh="thigh"/>', "")
         .replace('<mesh name="thigh" file="thigh.stl"/><mesh name="arm" file="/etc/passwd"/>', "")
     )
     whole = spec.compile()
     data, other = standing(model), mujoco.MjData(whole)
     other.qpos[:7] = data.qpos[:7]
-    for name, angle in description.standing:
+    for name, angle in given.table["standing"].items():
         other.joint(name).qpos[:] = angle
     mujoco.mj_forward(whole, other)
     np.testing.assert_allclose(data.subtree_com[1], other.subtree_com[1], atol=1e-12)
@@ -127,10 +153,10 @@ def test_solver_motors_and_floor_are_set_and_meshes_and_coupled_arms_are_left_ou
     arms = '<equality><joint joint1="waist" joint2="shoulder"/></equality>'
     frame = '<body name="camera"><joint name="pan"/></body>'  # without a mass, and welded
     weld = ("waist", "shoulder", "pan")
-    source = build_spec(small(tmp_path, free="", more=arms, arm=frame, weld=weld))
-    model = source.spec.compile()
+    given = small(tmp_path, free="", more=arms, arm=frame, weld=weld)
+    model, notes = compiled(given), standard(given).notes
     told = ("torque motors replace the actuators", "floor added", "<equality> is not used")
-    assert {*told, "4 meshes and pictures are not read"} <= set(source.notes)
+    assert {*told, "4 meshes and pictures are not read"} <= set(notes)
     assert (model.nq, model.nbody, model.nmesh) == (15, 10, 0)
     assert model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     assert (model.opt.timestep, model.opt.iterations) == (0.001, 10)
@@ -151,13 +177,12 @@ def test_the_limit_of_a_motor_is_the_smallest_that_the_file_states(tmp_path):
 
 
 def test_soles_of_two_or_four_contacts_stand_on_the_floor_with_their_spheres_alone(tmp_path):
-    description = small(tmp_path)
-    model = build_spec(description).spec.compile()
-    data, spheres = standing(model), set(contacts_of(description))
+    model = compiled(small(tmp_path))
+    data, spheres = standing(model), set(contacts_of(model))
     places = np.array([data.geom(name).xpos for name in spheres])
     np.testing.assert_allclose(places[:, 2], 0.01, atol=1e-12)
-    for side, foot in enumerate(description.named_feet):
-        site, y = data.site(foot.point).xpos, (0.1, -0.1)[side]
+    for side, y in (("left", 0.1), ("right", -0.1)):
+        site = data.site(f"{side}_point").xpos
         np.testing.assert_allclose(site[1:], [y, 0.0], atol=1e-12)
     data.qpos[2] -= 1e-4
     mujoco.mj_forward(model, data)
@@ -168,10 +193,10 @@ def test_soles_of_two_or_four_contacts_stand_on_the_floor_with_their_spheres_alo
     kinds = {mujoco.mjtGeom(int(kind)).name for kind in model.geom_type[colliding]}
     assert kinds == {"mjGEOM_SPHERE", "mjGEOM_BOX", "mjGEOM_CAPSULE"}
     corners = tuple((x, y, -0.04) for x in (0.07, -0.05) for y in (0.03, -0.03))
-    flat = small(tmp_path, contacts=corners)
+    flat = compiled(small(tmp_path, contacts=corners))
     names = [f"{side}_contact_{i}" for side in ("left", "right") for i in range(4)]
     assert contacts_of(flat) == names
-    assert all(compiled(flat).geom(name).type == mujoco.mjtGeom.mjGEOM_SPHERE for name in names)
+    assert all(flat.geom(name).type == mujoco.mjtGeom.mjGEOM_SPHERE for name in names)
 
 
 def test_a_keyframe_of_the_file_is_kept_when_joints_are_welded(tmp_path):
@@ -179,29 +204,29 @@ def test_a_keyframe_of_the_file_is_kept_when_joints_are_welded(tmp_path):
     key = f'<keyframe><key name="up" qpos="0 0 3 1 0 0 0 {legs} 0.4 1 {legs}"/></keyframe>'
     got = compiled(small(tmp_path, more=key, standing="up"))
     by_angles = compiled(small(tmp_path))
-    assert [got.key(i).name for i in range(got.nkey)] == ["up"]
+    assert [got.key(i).name for i in range(got.nkey)] == ["standing"]
     np.testing.assert_array_equal(got.key_qpos, by_angles.key_qpos)
     np.testing.assert_array_equal(got.body_inertia, by_angles.body_inertia)
 
 
 def test_the_mass_of_a_urdf_is_that_of_all_its_links_and_one_beside_a_robot_is_left_out(tmp_path):
     drawn = '<visual><geometry><box size="0 0 0"/></geometry></visual></link>'
-    urdf = urdf_of(mujoco.MjModel.from_xml_path(str(MODEL_PATH))).replace("</link>", drawn)
+    urdf = urdf_of(HECTOR).replace("</link>", drawn)
     held = LINK.replace("</i", '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></i')
     urdf = urdf.replace("</robot>", f"{held}{HOLD.format('hold', 'trunk', 'payload')}</robot>")
     masses = [float(x) for x in re.findall('<mass value="([^"]*)"', urdf)]
     model = compiled(by_numbers(tmp_path, urdf))
     assert model.body_mass.sum() == pytest.approx(sum(masses), rel=1e-12)
     lamp = '<body name="lamp"><geom size="1" mass="9" contype="0" conaffinity="0"/></body>'
-    source = build_spec(small(tmp_path, more=f"<worldbody>{lamp}</worldbody>"))
-    assert "left out, which no joint holds: lamp" in source.notes
-    without = compiled(small(tmp_path)).body_mass.sum()
-    assert source.spec.compile().body_mass.sum() == pytest.approx(without)
+    given = small(tmp_path, more=f"<worldbody>{lamp}</worldbody>")
+    assert "left out, which no joint holds: lamp" in standard(given).notes
+    mass = compiled(given).body_mass.sum()
+    assert mass == pytest.approx(compiled(small(tmp_path)).body_mass.sum())
 
 
 def test_names_are_the_files_own_and_what_has_none_gets_one(tmp_path):
-    description = small(tmp_path)
-    expected, path = compiled(description), description.model
+    given = small(tmp_path)
+    expected, path = compiled(given), given.model
     changes = [
         ('<geom type="box" size="0.05', '<geom name="floor" type="box" size="0.05'),
         ('<body name="[a-z]+_(hip|thigh|shin)"', "<body"),
@@ -212,10 +237,10 @@ def test_names_are_the_files_own_and_what_has_none_gets_one(tmp_path):
     ]
     path.write_text(replaced(path.read_text(), *changes))
     names = {"left_knee": "base", "right_ankle": "floor", "waist": "joint_5"}
-    joints = tuple(names.get(x, x) for x in description.joints)
-    stands = tuple((names.get(x, x), angle) for x, angle in description.standing)
-    weld = ("joint_5", "shoulder")
-    got = compiled(replace(description, joints=joints, weld=weld, standing=stands))
+    renamed = lambda words: [names.get(x, x) for x in words]  # noqa: E731
+    joints = {key: renamed(words) for key, words in given.table["joints"].items()}
+    stands = {names.get(x, x): angle for x, angle in given.table["standing"].items()}
+    got = compiled(given._replace(table=given.table | {"joints": joints, "standing": stands}))
     for name in ("body_mass", "body_inertia", "jnt_range", "key_qpos", "geom_size"):
         np.testing.assert_array_equal(getattr(got, name), getattr(expected, name))
     assert len({got.body(b).name for b in range(got.nbody)}) == got.nbody

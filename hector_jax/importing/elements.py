@@ -13,14 +13,15 @@ Bodies and joints without a name get one, by which descriptions and messages mea
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import short_repr
-from hector_jax.robot.checks import expect, listed
-from hector_jax.robot.links import MASSLESS
+from hector_jax.core.inputs import expect, listed, short_repr
+from hector_jax.importing.links import MASSLESS
+from hector_jax.importing.published import read_published
 from hector_jax.robot.mjcf import mujoco_errors, text_of
 
 _GEOM = mujoco.mjtGeom
@@ -39,40 +40,56 @@ _OF_OTHER_VERSIONS: dict[str, dict[str, str | None]] = {
 _JOINT_PARTS = ("parent", "child", "origin", "axis", "limit", "dynamics")
 
 
-def spec_of(
-    path: Path,
-    root: ElementTree.Element,
-    joints: Sequence[str],
-    keyframe: str | None,
-    weld: Sequence[str] = (),
-) -> tuple[mujoco.MjSpec, list[str]]:
-    """Return the spec of a file without unused parts, and one line per kind of removed part.
+class File(NamedTuple):
+    """A file without the parts that are not used, as MuJoCo reads it."""
 
-    Args:
-        path: of the file.
-        root: XML element of the file, changed in place.
-        joints: names of the legs' joints.
-        keyframe: name of the only keyframe to keep.
-        weld: joints that are fixed, and so what is coupled to them alone.
+    path: Path
+    root: ElementTree.Element  # with all its parts
+    spec: mujoco.MjSpec
+    model: mujoco.MjModel  # without motors and keyframes, which may not match it
+    notes: list[str]  # one line per kind of part that was removed or repaired
+
+    @property
+    def joints(self) -> list[str]:
+        """Names of the joints by index."""
+        return [self.model.joint(j).name for j in range(self.model.njnt)]
+
+
+def read_file(path: Path) -> File:
+    """Read a file without unused parts.
 
     Raises:
-        InputError: one line naming a body that loses its mass, or a coupling of leg joints; or
-            MuJoCo's error.
+        InputError: one line naming a body that loses its mass; or MuJoCo's error.
     """
-    check_couplings(path, root, joints, weld)
-    spec, notes, removed = parsed(path, root, joints, keyframe)
+    root, whole = read_published(path), read_published(path)
+    spec, notes, removed = parsed(path, root)
     removed += _remove_meshes(path, spec)
     notes += repair_inertias(path, spec)
-    return spec, [*notes, *[f"{removed} meshes and pictures are not read"] * bool(removed)]
+    notes += [f"{removed} meshes and pictures are not read"] * bool(removed)
+    return File(path, whole, spec, compile_bare(path, root, spec), notes)
 
 
-def parsed(
-    path: Path, root: ElementTree.Element, joints: Sequence[str], keyframe: str | None
-) -> tuple[mujoco.MjSpec, list[str], int]:
+def compile_bare(path: Path, root: ElementTree.Element, spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile a file without its motors and keyframes.
+
+    Raises:
+        InputError: MuJoCo's error in one line.
+    """
+    bare = spec.copy()
+    for part in (*bare.actuators, *bare.keys):
+        bare.delete(part)
+    # welded bodies may have no mass; `to_standard` checks the masses of the merged links
+    bare.compiler.boundmass = MASSLESS
+    bare.compiler.boundinertia = _NO_INERTIA
+    with mujoco_errors(path, root):
+        return bare.compile()
+
+
+def parsed(path: Path, root: ElementTree.Element) -> tuple[mujoco.MjSpec, list[str], int]:
     """Return the spec of a file with the meshes of an MJCF, none opened; notes; meshes removed."""
     removed, notes = 0, []
     if root.tag == "robot":
-        removed = _clean_urdf(path, root, joints)
+        removed = _clean_urdf(path, root)
     else:
         notes += _clean_options(root) + _add_trunk(root)
         for tag in _UNUSED:
@@ -85,17 +102,8 @@ def parsed(
         names = ", ".join(repr(x.get("name", "")) for x in held)
         text = f"{names} push bodies (gravcomp, actuators of sites and bodies), expected motors of "
         expect(path, not held, f"{text}joints alone: remove that")
-        of_joints = {"joint", "jointinparent"}
-        tendons = [x for x in root.findall("actuator/*") if not of_joints & {*x.attrib}]
-        for tag, unused in (("contact", root.findall("contact/pair")), ("actuator", tendons)):
-            notes += [f"<{part.tag}> of <{tag}> is not used" for part in unused[:1]]
-            for section in root.findall(tag):
-                _remove(section, [part for part in section if part in unused])
-        for section in root.findall("keyframe"):
-            _remove(section, [key for key in section if key.get("name") != keyframe])
-            for key in section:
-                for name in ("ctrl", "act", "mpos", "mquat"):  # their lengths may change
-                    key.attrib.pop(name, None)
+        for contact in root.findall("contact"):
+            _remove(contact, contact.findall("pair"))
     with mujoco_errors(path, root):
         spec = mujoco.MjSpec.from_string(text_of(root))
     _add_names(spec)
@@ -214,38 +222,39 @@ def _has_mass(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> bool:
     return bool(enabled and low <= geom.group <= high and mass)
 
 
-def check_couplings(
-    path: Path, root: ElementTree.Element, joints: Sequence[str], weld: Sequence[str]
-) -> None:
-    """Refuse an equality or a tendon that refers to a part of a leg, and to nothing welded.
+def check_couplings(file: File, joints: Sequence[str], weld: Sequence[str]) -> None:
+    """Refuse what couples a part of a leg, and nothing welded: equality, tendon or mimic.
 
     Raises:
         InputError: one line with the parts of the legs that it couples, and the remedy.
     """
     leg_parts, welded = set(joints), set(weld)
-    for body in root.iter("body"):
+    for joint in file.root.findall("joint[mimic]"):
+        name = joint.get("name", "")
+        text = f"joint {name!r} mimics another one, expected a free hinge"
+        expect(file.path, name not in leg_parts, text)
+    for body in file.root.iter("body"):
         own = {joint.get("name") for joint in body.findall("joint")}
         parts = {part.get("name", "") for part in body.iter() if part.tag != "default"}
         if own & {*joints}:
             leg_parts |= parts
         elif own and own <= {*weld}:
             welded |= parts
-    for tag in _COUPLINGS if root.tag == "mujoco" else ():
-        for coupling in root.findall(f"{tag}/*"):
-            references = {
-                value
-                for element in coupling.iter()
-                for name, value in element.attrib.items()
-                if name not in ("name", "class")
-            }
-            coupled = sorted(references & leg_parts)
-            open_ = references & welded or coupling.get("active") == "false"
-            text = f"<{coupling.tag}> of <{tag}> couples {', '.join(coupled)}, expected legs of "
-            text += "free hinges: remove it, or weld a joint of it (hector robot --weld NAME)"
-            expect(path, not coupled or open_, text)
+    for tag, coupling in ((of, x) for of in _COUPLINGS for x in file.root.findall(f"{of}/*")):
+        references = {
+            value
+            for element in coupling.iter()
+            for name, value in element.attrib.items()
+            if name not in ("name", "class")
+        }
+        coupled = sorted(references & leg_parts)
+        open_ = references & welded or coupling.get("active") == "false"
+        text = f"<{coupling.tag}> of <{tag}> couples {', '.join(coupled)}, expected legs of "
+        text += "free hinges: remove it, or weld a joint of it (hector robot --weld NAME)"
+        expect(file.path, not coupled or open_, text)
 
 
-def _clean_urdf(path: Path, root: ElementTree.Element, joints: Sequence[str]) -> int:
+def _clean_urdf(path: Path, root: ElementTree.Element) -> int:
     """Keep links of numbers and primitives, and free joints. Returns the number of meshes."""
     removed = 0
     _check_tree(path, root)
@@ -258,9 +267,6 @@ def _clean_urdf(path: Path, root: ElementTree.Element, joints: Sequence[str]) ->
         if world is not None and alone and not above and world.find("inertial") is None:
             _remove(root, [joint, world])
     for joint in root.findall("joint"):
-        name = joint.get("name")
-        mimics = joint.find("mimic") is not None and name in joints
-        expect(path, not mimics, f"joint {name!r} mimics another one, expected a free hinge")
         _remove(joint, [part for part in joint if part.tag not in _JOINT_PARTS])
     for link in root.findall("link"):
         _remove(link, [x for x in link.findall("collision") if x.find("geometry") is None])
@@ -271,7 +277,7 @@ def _clean_urdf(path: Path, root: ElementTree.Element, joints: Sequence[str]) ->
         _remove(link, meshes)
         for part in link.findall("inertial"):
             mass = part.find("mass")
-            # `read_mjcf` found numbers in it; MuJoCo refuses more than one
+            # `read_published` found numbers in it; MuJoCo refuses more than one
             if mass is None or float(mass.get("value", "0").split()[0]) == 0.0:
                 link.remove(part)
     # the root link stays a body, and a link without <inertial> has no mass

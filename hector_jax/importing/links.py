@@ -6,12 +6,13 @@ anchor; the trunk's is that of the body with the free joint.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
+from hector_jax.robot.poses import data_at, inertia_about, rotation_of
 
 MASSLESS = 1e-6  # [kg]: largest mass that `links_of` neglects
 
@@ -50,13 +51,6 @@ class Link(NamedTuple):
     bodies: dict[int, Pose]  # by index in the model
 
 
-def rotation_of(quat: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation matrix of a quaternion (w, x, y, z)."""
-    R = np.zeros(9)
-    mujoco.mju_quat2Mat(R, quat)
-    return R.reshape(3, 3)
-
-
 def pose_of(pos: Float[np.ndarray, "3"], quat: Float[np.ndarray, "4"]) -> Pose:
     """Return the pose of a position [m] and a quaternion."""
     return Pose(rotation_of(quat), np.array(pos))
@@ -91,26 +85,6 @@ def links_of(
     return links
 
 
-def data_at(model: mujoco.MjModel, angles: Mapping[Any, float] | None = None) -> mujoco.MjData:
-    """Return the kinematics in a pose with free bodies upright at the origin.
-
-    Args:
-        model: compiled.
-        angles: of joints [rad] by name or index; the other joints are at zero.
-    """
-    data = mujoco.MjData(model)
-    data.qpos[:] = 0.0
-    for kind, start in zip(model.jnt_type, model.jnt_qposadr, strict=True):
-        if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
-            data.qpos[start + 3 * (kind == mujoco.mjtJoint.mjJNT_FREE)] = 1.0
-    for joint, angle in (angles or {}).items():
-        if model.jnt_type[model.joint(joint).id] != mujoco.mjtJoint.mjJNT_BALL:
-            data.qpos[model.joint(joint).qposadr[0]] = angle
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    return data
-
-
 def subtree(model: mujoco.MjModel, root: int) -> list[int]:
     """Return a body and all its descendants, parents first."""
     bodies = [root]
@@ -133,25 +107,3 @@ def _composite(
     com = masses @ centers / masses.sum()
     inertia = inertia_about(com, masses, model.body_inertia[heavy], R, centers)
     return float(masses.sum()), com, inertia
-
-
-def inertia_about(
-    point: Float[np.ndarray, "3"],
-    masses: Float[np.ndarray, " b"],
-    moments: Float[np.ndarray, "b 3"],
-    R: Float[np.ndarray, "b 3 3"],
-    centers: Float[np.ndarray, "b 3"],
-) -> Float[np.ndarray, "3 3"]:
-    """Return the inertia [kg m^2] about a point of bodies fixed to each other.
-
-    Args:
-        point: [m].
-        masses: [kg].
-        moments: principal moments of inertia [kg m^2].
-        R: principal axes, as columns.
-        centers: centres of mass [m].
-    """
-    own = np.einsum("bij,bj,bkj->bik", R, moments, R)
-    arm = centers - point
-    square = np.einsum("bi,bi->b", arm, arm)[:, None, None] * np.eye(3)
-    return (own + masses[:, None, None] * (square - arm[:, :, None] * arm[:, None, :])).sum(axis=0)
