@@ -632,7 +632,7 @@ def other_pages():
     known = foretell.calibrated(foretell.HERE)["L"]
     ends = [(foretell.interval(x["foretold"]["L"], known), x["walked"]["L"]) for x in pairs]
     held = sum(low <= came <= high for (_, low, high), came in ends)
-    text = f"{held} of {len(pairs)} held what came, of {0.9 * len(pairs):.0f} that should"
+    text = f"{held} of {len(pairs)} intervals held what came; {0.9 * len(pairs):.0f} should"
     yield DOCS / "howto" / "walks.md", text
     cases = report("foretell/cases.json")
     shifted = [pair for pair in cases["pairs"] if pair["world"] == "shifted"]
