@@ -125,6 +125,7 @@ REFUSED = [  # the whole of what is said, or a part of it
     (f"walk --world srbm --plant {ARMS}", "--plant needs a world of MuJoCo, got --world srbm"),
     ("walk --weights exprt", "'exprt'; did you mean 'expert'?"),
     ("walk --gait trot", "--gait: trot is for 4 legs, not 2"),
+    ("walk --weights best", "got 'best'; that is `shipped` now, or weights/best.json of a run"),
     (f"walk --weights shipped {STRIDER}", "strider/robot-shipped.json; tune this robot"),
     ("walk --traj examples/slalom.toml --seconds 4", "slalom lasts 6 s, as its file says, got 4"),
     ("walk --traj examples/slalom.toml --seconds 2 --out never.npz", "got 2"),

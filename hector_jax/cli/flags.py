@@ -237,8 +237,7 @@ class Propose(ForRobot, ByPlanner, Printed):
 
     folder: Folder  # of this tuning; a later call needs no other flag
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
-    # weights of the first walk: nominal, expert, shipped or a weights file
-    start: Weights = "shipped"
+    start: Weights = "shipped"  # of the first walk: nominal, expert, shipped or a weights file
     # weights: Q and R; also footsteps, integral, all, or numbers by name
     tune: tuple[Tunables, ...] = ("weights",)
 
@@ -321,8 +320,7 @@ class Twin(Check, ByPlanner):
     Example: hector log twin mine.npz --robot mine.toml --traj straight --weights mine.json
     """
 
-    # with which the log was walked: a file, nominal, expert or shipped
-    weights: Weights = "nominal"
+    weights: Weights = "nominal"  # of the walk: nominal, expert, shipped or a weights file
 
 
 @_command
@@ -333,8 +331,7 @@ class Foretell(ForRobot, ByPlanner, ByMapping, Printed):
     """
 
     logs: tuple[Annotated[Path, PathKind.BAG], ...]  # of one robot and one trajectory
-    # with which they were walked: a file, nominal, expert or shipped
-    walked: Weights = "nominal"
+    walked: Weights = "nominal"  # of the walks: nominal, expert, shipped or a weights file
     weights: tuple[Weights, ...] = ("shipped",)  # that are foretold
     traj: Trajectory = "straight"  # that was walked: a name or a TOML file
     seconds: Seconds = 4.0  # length of the walks [s]

@@ -335,8 +335,7 @@ def _check_source(label: str, value: Path | str, source: PathKind) -> None:
     existing = next(x for x in (path, *path.parents) if os.path.exists(x))
     valid, is_file = {
         PathKind.FILE: (True, True),
-        PathKind.LOG: (True, not is_dir),
-        PathKind.BAG: (True, not is_dir),
+        **dict.fromkeys((PathKind.LOG, PathKind.BAG), (True, not is_dir)),
         PathKind.RUN: (is_dir, False),
         PathKind.FOLDER: (os.path.isdir(existing), False),
         PathKind.EXPORTABLE: (True, not named and not is_dir),
@@ -348,9 +347,8 @@ def _check_source(label: str, value: Path | str, source: PathKind) -> None:
     }[source]
     if not valid:
         of_sets = source in (PathKind.WEIGHTS, PathKind.SETS)
-        hint = did_you_mean(text, NAMED_WEIGHTS) if of_sets else ""
-        if of_sets and text == "best":
-            hint = ": the set that ships is `shipped` now, that of a run its weights/best.json"
+        renamed = {"best": "; that is `shipped` now, or weights/best.json of a run"}
+        hint = renamed.get(text, did_you_mean(text, NAMED_WEIGHTS)) if of_sets else ""
         raise InputError(f"{label} must be {source.value}, got {one_line(str(value))!r}{hint}")
     if is_file:
         check_file(path, "the file")
