@@ -2,6 +2,11 @@
 
     method        how a tuning works, as a block diagram
     own           a controller of one's own: what its user provides, and the first minutes
+    worlds        who may read which simulated robots
+    commands      which command is for whom
+    time          calls of the exported controller, and the first seconds of a walk
+    foot          points, lengths and signs of a foot
+    weights       the weights expert and shipped by the nominal ones
     film          the robot with plain and with tuned weights, side by side
     before-after  errors along one walk of the sets nominal, expert and shipped
     foretold      loss walked by loss foretold, with intervals
@@ -30,8 +35,7 @@ from typing import Any
 
 import numpy as np
 import tyro
-from matplotlib.axes import Axes
-from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
+from diagrams import DIAGRAMS
 from PIL import Image, ImageDraw, ImageFont
 from plots import draw_repeats, forecasts
 
@@ -51,7 +55,7 @@ from hector_jax.control.weights_file import shipped
 from hector_jax.core.console import exit_code, say
 from hector_jax.core.settings import check
 from hector_jax.core.trajectory import Trajectory
-from hector_jax.report.plots.style import SETS, drawing, label_of, looks_of
+from hector_jax.report.plots.style import drawing, label_of, looks_of
 from hector_jax.robot.model import Robot
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections
@@ -89,128 +93,6 @@ def walk_of(robot: Robot, weights: Weights, plant: Imperfections, seconds: float
     """Walk a robot straight ahead on a plant."""
     job = Job(weights, named_command("straight"), plant, seconds)
     return walk(walk_config(robot), robot, job)
-
-
-# The method
-
-
-def _box(
-    axes: Axes, place: tuple[float, float], size: tuple[float, float], text: str, **look: str
-) -> None:
-    """Draw a box around a place, with a title and lines below it."""
-    (x, y), (width, height) = place, size
-    face: dict[str, Any] = {"facecolor": "#eef1f5", "edgecolor": "#33383f", **look}
-    shape = "round,pad=0,rounding_size=0.08"
-    corner = x - width / 2, y - height / 2
-    axes.add_patch(FancyBboxPatch(corner, width, height, boxstyle=shape, linewidth=1.2, **face))
-    title, *rest = text.split("\n")
-    up = 0.13 * len(rest)
-    centre: dict[str, Any] = {"ha": "center", "va": "center"}
-    axes.text(x, y + up, title, weight="bold", fontsize=11, **centre)
-    for i, line in enumerate(rest, 1):
-        axes.text(x, y + up - 0.27 * i, line, fontsize=9.5, **centre)
-
-
-def _arrow(
-    axes: Axes,
-    *points: tuple[float, float],
-    text: str = "",
-    at: tuple[float, float] = (0.0, 0.0),
-    **look: Any,
-) -> None:
-    """Draw an arrow along some points, with words at a place."""
-    line: dict[str, Any] = {"color": "#33383f", "linewidth": 1.6, **look}
-    for start, end in zip(points[:-2], points[1:-1], strict=True):
-        axes.plot(*zip(start, end, strict=True), solid_capstyle="round", **line)
-    style = "-|>,head_width=3.5,head_length=6"
-    last: dict[str, Any] = {"arrowstyle": style, "shrinkA": 0.0, "shrinkB": 0.0}
-    axes.add_patch(FancyArrowPatch(points[-2], points[-1], **last, **line))
-    if text:
-        axes.text(at[0], at[1], text, fontsize=9.5, ha="center", va="center", color=line["color"])
-
-
-def draw_method(path: Path) -> None:
-    """Draw the closed loop that is differentiated, and the way of its gradient."""
-    blue, orange = SETS["best"]["color"], "#b8560f"
-    with drawing(path, 9.6, 3.7, legend_columns=0) as figure:
-        axes = figure.subplots()
-        axes.set(xlim=(0, 12.2), ylim=(-0.05, 4.65), aspect="equal")
-        axes.axis("off")
-        main, y = (2.0, 1.15), 3.0
-        _box(axes, (0.85, y), (1.4, 1.15), "command\nvelocity,\nturning rate", facecolor="white")
-        _box(axes, (3.35, y), main, "MPC\na quadratic program\nwith weights Q, R")
-        _box(axes, (6.35, y), main, "ground model\nGRFM-Net: wished to\nreal ground force")
-        _box(axes, (9.1, y), (1.7, 1.15), "rigid body\ntrunk with\nmass, inertia")
-        _box(axes, (11.35, y), (1.4, 1.15), "loss\nerrors and\njerky forces", facecolor="white")
-        _arrow(axes, (1.55, y), (2.35, y))
-        _arrow(axes, (4.35, y), (5.35, y), text="wrench", at=(4.85, y + 0.22))
-        _arrow(axes, (7.35, y), (8.25, y), text="effect", at=(7.8, y + 0.22))
-        _arrow(axes, (9.95, y), (10.65, y))
-        top = 4.2
-        loop = (9.1, y + 0.58), (9.1, top), (3.35, top), (3.35, y + 0.58)
-        words = "state, every 10 ms, for a walk of 4 s (all of this is one program in JAX)"
-        _arrow(axes, *loop, text=words, at=(6.2, top + 0.2))
-        low = 1.55
-        back = (11.35, y - 0.58), (11.35, low), (3.35, low), (3.35, y - 0.58)
-        words = (
-            "gradient through every quadratic program: next Q, R (Gauss-Newton, at most ten steps)"
-        )
-        _arrow(axes, *back, text=words, at=(7.5, low - 0.22), color=blue, linewidth=2.6)
-        _box(axes, (1.55, 0.5), (2.6, 0.85), "MuJoCo\n64 walks, measured forces", edgecolor=orange)
-        learns = (2.85, 0.5), (6.35, 0.5), (6.35, low - 0.42)
-        axes.plot([6.35, 6.35], [low + 0.08, y - 0.72], color=orange, linewidth=1.6)
-        axes.plot(*zip(*learns, strict=True), color=orange, linewidth=1.6)
-        _arrow(axes, (6.35, y - 0.8), (6.35, y - 0.58), color=orange)
-        axes.text(4.6, 0.7, "trains, once", fontsize=9.5, ha="center", color=orange)
-
-
-def draw_own(path: Path) -> None:
-    """Draw what the user of a controller provides, what is done with it, and the first minutes."""
-    blue = SETS["best"]["color"]
-    with drawing(path, 9.6, 4.6, legend_columns=0) as figure:
-        axes = figure.subplots()
-        axes.set(xlim=(0, 12.2), ylim=(-0.1, 5.75), aspect="equal")
-        axes.axis("off")
-        for x, text, color in ((2.1, "you provide", "#33383f"), (8.5, "hector_jax does", blue)):
-            axes.text(x, 5.55, text, weight="bold", fontsize=12, ha="center", color=color)
-        rows = (
-            (4.85, "walker\nweights, command in; log out", "is it the weights?\nhector log check"),
-            (
-                3.8,
-                "planner, or [twin]\nstate, feet, weights in; plan out",
-                "conventions, parity\nhector log twin",
-            ),
-            (
-                2.75,
-                "robot.toml, mine.json\nmodel of the robot, your weights",
-                "walks and slopes\nhector tune --walker",
-            ),
-        )
-        for y, given, done in rows:
-            _box(axes, (2.1, y), (4.0, 0.85), given, facecolor="white")
-            _box(axes, (8.5, y), (3.6, 0.85), done, edgecolor=blue)
-            _arrow(axes, (4.1, y), (6.7, y))
-        axes.text(5.4, 5.05, "log.npz, a bag", fontsize=9.5, ha="center")
-        axes.text(5.4, 4.0, "plans", fontsize=9.5, ha="center")
-        words = "best.json, your format"
-        _arrow(axes, (10.3, 2.75), (11.6, 2.75), color=blue, linewidth=2.6)
-        axes.text(10.95, 2.1, words, fontsize=9.5, ha="center", color=blue)
-        axes.text(0.1, 1.55, "the first ten minutes", weight="bold", fontsize=11)
-        words = "as they went for a controller in C++ on two busy cores"
-        axes.text(3.3, 1.55, words, fontsize=9.5)
-        axes.plot([0.4, 11.8], [1.0, 1.0], color="#33383f", linewidth=1.6)
-        steps = (
-            (0, "robot.toml, mine.json,\nthe walker"),
-            (2, "hector walk"),
-            (4, "log check"),
-            (5, "log twin"),
-            (9.5, "its lines to paste:\nparity to 0.5 N"),
-        )
-        for minute, text in steps:
-            x = 1.0 + 1.03 * minute
-            axes.plot(x, 1.0, "o", color=blue, markersize=7)
-            axes.text(x, 1.2, f"{minute:g}", fontsize=9.5, ha="center")
-            axes.text(x, 0.75, text, fontsize=9.5, ha="center", va="top")
 
 
 # The walks
@@ -383,8 +265,7 @@ def draw_foretold(path: Path) -> None:
 
 
 PICTURES: dict[str, tuple[Path, Callable[[Path], None] | None]] = {
-    "method": (OUT / "method.svg", draw_method),
-    "own": (OUT / "own.svg", draw_own),
+    **{name: (OUT / f"{name}.svg", draw) for name, draw in DIAGRAMS.items()},
     "film": (ROOT / "docs" / "walk.webp", draw_film),
     "before-after": (OUT / "before-after.png", draw_before_after),
     "foretold": (OUT / "foretold.png", draw_foretold),

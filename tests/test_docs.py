@@ -21,6 +21,7 @@ import jax
 import numpy as np
 import pytest
 from delay import AS_PROPOSED, BEFORE
+from diagrams import CHOICES
 from pretend import pretend_verdict, python
 
 from hector_jax import load_robot, nominal, walk_config
@@ -109,6 +110,14 @@ def test_commands_of_a_page_parse_and_what_it_names_is_there(path, capsys):
     for name, test, more in re.findall(r"(test_\w+)\.py(?:::(test_\w+)(\.\.\.)?)?", text):
         tests = (ROOT / "tests" / f"{name}.py").read_text()
         assert f"def {test}" + ("" if more or not test else "(") in tests, (name, test)
+
+
+def test_commands_of_the_tree_parse():
+    for *_, commands in CHOICES:
+        for line in commands:
+            program, *words = line.split()
+            assert program == "hector"
+            parse.from_line(words)
 
 
 PACKAGE = ROOT / "hector_jax"
@@ -623,7 +632,7 @@ def other_pages():
     known = foretell.calibrated(foretell.HERE)["L"]
     ends = [(foretell.interval(x["foretold"]["L"], known), x["walked"]["L"]) for x in pairs]
     held = sum(low <= came <= high for (_, low, high), came in ends)
-    text = f"{held} of {len(pairs)} held what came, of {0.9 * len(pairs):.0f} that should"
+    text = f"{held} of {len(pairs)} intervals held what came; {0.9 * len(pairs):.0f} should"
     yield DOCS / "howto" / "walks.md", text
     cases = report("foretell/cases.json")
     shifted = [pair for pair in cases["pairs"] if pair["world"] == "shifted"]

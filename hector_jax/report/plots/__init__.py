@@ -153,7 +153,7 @@ def save_weight_bars(
         sets: `nominal`, `expert` and tuned sets, flat in the order of `names`.
     """
     ratio = {name: np.divide(values, sets["nominal"]) for name, values in sets.items()}
-    bars = [name for name in ("without", "with", "best") if name in sets]
+    bars = [name for name in ("without", "with", "best", "shipped") if name in sets]
     with drawing(path, 10.0, 3.4) as figure:
         axes = figure.subplots()
         for i, name in enumerate(bars):
