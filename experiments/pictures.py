@@ -21,7 +21,6 @@ Walks are those of the first plant of the hardware stand-in, which no tuning has
 """
 
 import json
-import re
 import subprocess
 import sys
 import tempfile
@@ -56,15 +55,23 @@ from hector_jax.core.console import exit_code, say
 from hector_jax.core.settings import check
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.report.plots.style import drawing, label_of, looks_of
-from hector_jax.robot.model import Robot
+from hector_jax.robot.model import Robot, compile_model
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections
 from hector_jax.verdict.foretell import HERE, calibrated
+from hector_jax.view.live import Call, Frame, Session
+from hector_jax.view.live_page import LivePage
+from hector_jax.view.live_tuning import Tuner
+from hector_jax.view.live_weights import PageSetup
 from hector_jax.view.motion import motions
+from hector_jax.view.page import opened_server
 from hector_jax.view.video import VideoConfig, write_film, write_strip
 
 ROOT = Path(__file__).parents[1]
 OUT = ROOT / "docs" / "pictures"
+sys.path.insert(0, str(ROOT / "tests"))  # the browser of its tests
+_FRAME = 0.2  # [s] of the film of the live page
+_TICKS = 4  # from frame to frame that the page is shown
 FORETOLD = ROOT / "experiments" / "reports" / "foretell" / "standin.json"
 RACE = ROOT / "experiments" / "reports" / "race" / "nominal" / "race.json"
 CLOSE_NOTICES = "document.querySelectorAll('.mantine-CloseButton-root').forEach(x => x.click())"
@@ -181,51 +188,89 @@ def draw_page(path: Path, run: Path) -> None:
 
 
 def draw_live(path: Path) -> None:
-    """Take a picture of the page of `hector view --live`, after some seconds of walking."""
-    _take_picture(path, ["--live", "--weights", "nominal", "shipped"], "Real-time factor", 25.0)
+    """Take a picture of the page of `hector view --live`, after eight seconds of walking."""
+    with _live_page({"nominal": nominal(), "shipped": shipped()}, 960) as (tab, go):
+        go(8.0)
+        Image.fromarray(tab.picture()).save(path, optimize=True)
 
 
 def draw_live_film(path: Path) -> None:
-    """Film the page of `hector view --live` at a tenth of its speed, shown ten times as fast.
+    """Film ten seconds of the page of `hector view --live`.
 
-    Q_pitch is turned down after three seconds and back after six; a push from behind follows.
+    Q_pitch is turned down after two seconds and back after six; a push from behind follows.
     """
     acts = {
-        3.0: lambda tab: tab.fill("Q_pitch", "0"),
+        2.0: lambda tab: tab.fill("Q_pitch", "-0.5"),
         6.0: lambda tab: tab.click("Undo"),
-        8.0: lambda tab: tab.click("from behind"),
+        7.6: lambda tab: tab.click("from behind"),
     }
     frames: list[Image.Image] = []
-    flags = ["--live", "--weights", "shipped"]
-    with _opened_page(flags, "Real-time factor", 20.0, height=720) as tab:
-
-        def now() -> float:
-            return float(re.search(r"shipped: (-?[\d.]+) s; ", tab.text())[1])  # pyright: ignore
-
-        tab.fill("speed [real time]", "0.1")
-        start = shown = now()
-        while shown < start + 10.0:
-            if (at := now()) < shown + 0.2:
-                continue
-            for due in [due for due in acts if due < at - start]:
+    with _live_page({"shipped": shipped()}, 720) as (tab, go):
+        go(4.0)
+        for frame in range(round(10.0 / _FRAME)):
+            for due in [due for due in acts if due <= frame * _FRAME]:
                 acts.pop(due)(tab)
-            shown = at
+                time.sleep(1.0)  # until the page has told the server
+            go(_FRAME)
             frames.append(Image.fromarray(tab.picture()).resize((800, 480)))
-    frames[0].save(
-        path, save_all=True, append_images=frames[1:], duration=200, loop=0, quality=60, method=6
-    )
+    options: dict[str, Any] = {"duration": round(1e3 * _FRAME), "loop": 0, "quality": 60}
+    frames[0].save(path, save_all=True, append_images=frames[1:], **options)
+
+
+@contextmanager
+def _live_page(
+    sets: dict[str, Weights], height: int
+) -> Iterator[tuple[Any, Callable[[float], None]]]:
+    """Open the page of a live walk in a browser; yields its tab, and a function that walks on.
+
+    The walk waits for the browser, which draws slowly where there is no graphics card; its
+    real-time factor is by the time of the processor.
+    """
+    from browser import opened  # pyright: ignore[reportMissingImports]
+
+    robot = load_robot()
+    plant, command = hfs(robot.description), named_command("straight")
+    session = Session(robot, [Job(weights, command, plant) for weights in sets.values()])
+    session.warm_up()
+    named, model = {"nominal": nominal(), "shipped": shipped()}, compile_model(robot.description)
+    setup = PageSetup(robot, model, sets, list(sets), named, "hfs", 0, lambda *_: "")
+    with opened_server("127.0.0.1", 8765) as (server, address):
+        page = LivePage(server, setup, _Direct(session), Tuner(None, robot))  # pyright: ignore
+
+        def go(seconds: float) -> None:
+            ticks = round(seconds / session.config.gait.tick)
+            page.work()
+            start = time.process_time()
+            for k in range(ticks):
+                session.tick()
+                if k % _TICKS == _TICKS - 1 or k == ticks - 1:
+                    factor = min(seconds * (k + 1) / ticks / (time.process_time() - start), 1.0)
+                    page.show(Frame(*session.frame(), factor, wanted=1.0, compilations=0))
+            time.sleep(1.0)  # until it is drawn
+
+        with tempfile.TemporaryDirectory() as profile, opened(address, profile, height) as tab:
+            go(0.1)
+            while "Real-time factor" not in tab.text():
+                time.sleep(2.0)
+            time.sleep(20.0)  # the scene fades in
+            tab.call("Runtime.evaluate", expression=CLOSE_NOTICES)
+            yield tab, go
+
+
+@dataclass
+class _Direct:
+    """A pipe to a session that answers at once."""
+
+    session: Session
+
+    def send(self, call: Call) -> None:
+        """Do what the page calls."""
+        name, values = call
+        getattr(self.session, name)(*values)
 
 
 def _take_picture(path: Path, flags: list[str], words: str, seconds: float) -> None:
     """Take a picture of the page of `hector view`, so long after it shows these words."""
-    with _opened_page(flags, words, seconds) as tab:
-        Image.fromarray(tab.picture()).save(path, optimize=True)
-
-
-@contextmanager
-def _opened_page(flags: list[str], words: str, seconds: float, height: int = 960) -> Iterator[Any]:
-    """Open the page of `hector view` in a browser, until so long after it shows these words."""
-    sys.path.insert(0, str(ROOT / "tests"))
     from browser import opened  # pyright: ignore[reportMissingImports]
 
     line = [sys.executable, "-m", "hector_jax", "view", *flags, "--port", "8765"]
@@ -233,17 +278,14 @@ def _opened_page(flags: list[str], words: str, seconds: float, height: int = 960
     try:
         assert server.stderr is not None
         address = next(x for x in server.stderr if x.startswith("open http")).split()[1]
-        with (
-            tempfile.TemporaryDirectory() as profile,
-            opened(address, profile, height=height) as tab,
-        ):
+        with tempfile.TemporaryDirectory() as profile, opened(address, profile, height=960) as tab:
             deadline = time.monotonic() + 240.0
             while words not in tab.text() and time.monotonic() < deadline:
                 time.sleep(2.0)
             time.sleep(seconds)
             tab.call("Runtime.evaluate", expression=CLOSE_NOTICES)
             time.sleep(2.0)
-            yield tab
+            Image.fromarray(tab.picture()).save(path, optimize=True)
     finally:
         server.terminate()
         server.wait()
