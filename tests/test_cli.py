@@ -157,7 +157,7 @@ REFUSED = [  # the whole of what is said, or a part of it
     ("evaluate --walker mine.py --walker-uses gone", "gone: no such file or folder"),
     (
         "evaluate --weights expert --out out",
-        "--weights must be nominal, which changes are against, and",
+        "which changes are against, and other sets",
     ),
     ("evaluate --weights nominal nominla", "got 'nominla'; did you mean 'nominal'?"),
     ("evaluate --weights nominal expert=c.json", "there is a set 'expert' already; use NAME="),

@@ -303,7 +303,10 @@ def test_each_engine_and_model_stops_where_it_is_clear(monkeypatch, capsys, walk
             ("--plant", "heavy", "--other-seeds", 6),
             "8 plants or more for 2 claims, got 6 in MuJoCo",
         ),
-        (("--weights", "expert", "mine=shipped"), "--weights must be nominal, which changes are"),
+        (
+            ("--weights", "yours=expert", "mine=shipped"),
+            "nominal, expert or start=FILE, which changes are",
+        ),
     ],
 )
 def test_what_can_never_be_clear_is_refused_before_a_walk(

@@ -38,7 +38,7 @@ from hector_jax.sim.world import Imperfections
 from hector_jax.store import tunings
 from hector_jax.store.run import Run
 from hector_jax.store.setup import Setup
-from hector_jax.verdict import judging
+from hector_jax.verdict import judging, metrics
 from hector_jax.verdict.matrix import OWN, Column, Columns, cells_of
 from hector_jax.verdict.stopping import StoppingRule
 
@@ -198,7 +198,7 @@ def _sets(
 
     Raises:
         InputError: a name is repeated; a file is not a weight set; or, where claims are made of
-            pairs, there is no other set beside nominal.
+            pairs, there is no baseline or no other set.
     """
     given = [named_file(text) for text in args.weights]
     short = arguments.short_names([file for name, file in given if not name])
@@ -207,8 +207,9 @@ def _sets(
         if name in files or (name in BASELINES and file != name):
             raise InputError(f"--weights {file}: there is a set {name!r} already; use NAME={file}")
         files[name] = file
-    if paired and ("nominal" not in files or len(files) < 2):
-        raise InputError("--weights must be nominal, which changes are against, and other sets")
+    if paired and (len(files) < 2 or not {*metrics.BASELINES} & {*files}):
+        against = "nominal, expert or start=FILE, which changes are against, and other sets"
+        raise InputError(f"--weights must have {against}")
 
     def load(file: str, trajectory: str) -> Weights:
         if file not in NAMED_WEIGHTS and Path(file).is_dir():

@@ -14,7 +14,14 @@ from hector_jax.report.report import Picture, change_text, markdown_table, rende
 from hector_jax.sim.engine import ENGINES
 from hector_jax.verdict import matrix
 from hector_jax.verdict.matrix import OWN, Cells, Column, Columns, Judgement
-from hector_jax.verdict.metrics import BASELINES, FEWEST, Interval, compare, fixed_rank
+from hector_jax.verdict.metrics import (
+    BASELINES,
+    FEWEST,
+    Interval,
+    baseline_of,
+    compare,
+    fixed_rank,
+)
 from hector_jax.verdict.stopping import claims_of
 
 TITLES = {name: engine.title for name, engine in ENGINES.items()}
@@ -63,6 +70,7 @@ def claims(
         "seeds": list(dict.fromkeys(seeds_text(v.seeds) for v in verdicts.values())),
         "learned_from": [titles[name] for name in engines if name in LEARNED_FROM],
         "tuned": [name for name in judgement.falls if name not in BASELINES],
+        "baseline": baseline_of(judgement.falls),
         "stopped": any(verdict.rank is not fixed_rank for verdict in cells.values()),
         "differs": {TITLES.get(name, name): text for name, text in differs.items()},
     }
@@ -94,7 +102,7 @@ def tables(cells: Cells) -> dict[str, str]:
 
 def print_matrix(cells: Cells, lines: Iterable[str]) -> None:
     """Print the change of every set in every cell, and the claims, a line each."""
-    baseline = BASELINES[0]
+    baseline = baseline_of(matrix.sets_of(cells))
     print(f"change of L against {baseline} in %, with falls where there are any")
     for cell, verdict in cells.items():
         texts = []
@@ -134,7 +142,8 @@ def stopping_result(
         per_plant = len(verdict.scores) * len(verdict.scenes)
         numbers = {"plants": plants, "most_plants": most}
         numbers |= {"walks": per_plant * plants, "walks_saved": per_plant * (most - plants)}
-        result.append({**column._asdict(), **numbers, "claims": claims_of(verdict)})
+        against = {"baseline": baseline_of(verdict.scores), "claims": claims_of(verdict)}
+        result.append({**column._asdict(), **numbers, **against})
     return result
 
 

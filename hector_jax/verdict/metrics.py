@@ -14,7 +14,7 @@ A fall stays in the numbers with the charge of the loss. A comparison counts onl
 falls more often than the other by 2 of 32 walks or the same share.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -253,6 +253,15 @@ def summarize(verdict: Verdict, name: str, others: Sequence[str] = BASELINES) ->
         int(verdict.scores[name].fallen.sum()),
         {other: compare(verdict, name, other) for other in against},
     )
+
+
+def baseline_of(names: Collection[str]) -> str:
+    """Return the first of BASELINES among the names of sets, which claims are made against.
+
+    >>> baseline_of(["start", "best"])
+    'start'
+    """
+    return next(name for name in BASELINES if name in names)
 
 
 def family_of(world: str) -> str | None:

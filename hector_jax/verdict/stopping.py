@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from hector_jax.verdict import metrics
-from hector_jax.verdict.metrics import BASELINES, COVERAGE, Comparison, Verdict
+from hector_jax.verdict.metrics import COVERAGE, Comparison, Verdict
 
 SAME = 5.0  # [%] a median change of L that is surely smaller than this is no difference
 UNCLEAR = "unclear"
@@ -86,8 +86,8 @@ def claim_of(comparison: Comparison) -> str:
 
 
 def claims_of(verdict: Verdict) -> dict[str, dict[str, str]]:
-    """Return the claim about each set against nominal, by scene and set."""
-    base = BASELINES[0]
+    """Return the claim about each set against the baseline, by scene and set."""
+    base = metrics.baseline_of(verdict.scores)
     return {
         scene: {
             name: claim_of(metrics.compare(verdict.of_scene(scene), name, base))

@@ -25,7 +25,7 @@ from hector_jax.report.report import caption
 from hector_jax.tuning.difftune import Iteration
 from hector_jax.tuning.loss import Loss
 from hector_jax.verdict.matrix import Cells, Column, columns_of, sets_of, trajectories_of
-from hector_jax.verdict.metrics import BASELINES, Verdict, compare
+from hector_jax.verdict.metrics import Verdict, baseline_of, compare
 
 
 def save_tracking(path: Path, walks: Mapping[str, Trajectory]) -> str:
@@ -267,7 +267,7 @@ def save_matrix(path: Path, cells: Cells, title_of: Callable[[Column], str]) -> 
         for panel, trajectory in zip(panels, trajectories, strict=True):
             panel.axvline(0.0, color="black", linewidth=1.0, zorder=1)
             _draw_sets(panel, [cells[column, trajectory] for column in columns], names)
-            panel.set(title=trajectory, xlabel=f"change of L against {BASELINES[0]} [%]")
+            panel.set(title=trajectory, xlabel=f"change of L against {baseline_of(names)} [%]")
             panel.grid(visible=False, axis="y")
             for edge, (above, below) in enumerate(pairwise(columns)):
                 color = "0.9" if above.engine == below.engine else "0.4"
@@ -275,7 +275,7 @@ def save_matrix(path: Path, cells: Cells, title_of: Callable[[Column], str]) -> 
         panels[0].set_yticks(range(len(columns)), [title_of(column) for column in columns])
         panels[0].set(ylim=(len(columns) - 0.5, -0.5), xlim=(-100.0, _WORST + 45.0))
         setp(panels, xticks=[-100, -50, 0, 50])
-    return caption("matrix")
+    return caption("matrix", baseline=baseline_of(names))
 
 
 _WORST = 60.0  # [%] a larger change is drawn as an arrow
@@ -285,7 +285,7 @@ def _draw_sets(panel: Axes, verdicts: Sequence[Verdict], names: Sequence[str]) -
     for i, (name, look) in enumerate(looks_of(names).items()):
         edge = {"color": look.color, "ha": "right", "va": "center", "fontsize": 7}
         for row, verdict in enumerate(verdicts):
-            comparison = compare(verdict, name, BASELINES[0])
+            comparison = compare(verdict, name, baseline_of(names))
             y = row + 0.8 * ((i + 0.5) / len(names) - 0.5)
             value, low, high = comparison.change["L"]
             dot = dict(look.dot, markerfacecolor=look.color if comparison.counts else "white")
