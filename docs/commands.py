@@ -19,7 +19,7 @@ _HEAD = """\
 
 This page is the reference of all commands and flags, for whoever looks one up. It is written from
 the code by `python docs/commands.py`; do not edit it. `hector COMMAND --help-all` shows the same
-with choices and ranges. A flag without a value is a switch; `--no-NAME` turns it off where it is
+with choices. A flag without a value is a switch; `--no-NAME` turns it off where it is
 on. A value that begins with a dash is written `--out=-dash.npz`. `hector --tyro-print-completion
 bash` (or zsh, fish) prints the script that completes `hector` in a shell.
 """

@@ -238,15 +238,16 @@ def _live_page(
         page = LivePage(server, setup, _Direct(session), Tuner(None, robot))  # pyright: ignore
 
         def go(seconds: float) -> None:
-            ticks = round(seconds / session.config.gait.tick)
+            ticks, spent = round(seconds / session.config.gait.tick), 0.0
             page.work()
-            start = time.process_time()
             for k in range(ticks):
+                start = time.process_time()
                 session.tick()
+                spent += time.process_time() - start
                 if k % _TICKS == _TICKS - 1 or k == ticks - 1:
-                    factor = min(seconds * (k + 1) / ticks / (time.process_time() - start), 1.0)
+                    factor = min(seconds * (k + 1) / ticks / spent, 1.0)
                     page.show(Frame(*session.frame(), factor, wanted=1.0, compilations=0))
-            time.sleep(1.0)  # until it is drawn
+            time.sleep(max(2.0 * seconds, 1.0))  # until it is drawn
 
         with tempfile.TemporaryDirectory() as profile, opened(address, profile, height) as tab:
             go(0.1)
@@ -292,9 +293,9 @@ def _take_picture(path: Path, flags: list[str], words: str, seconds: float) -> N
 
 
 def draw_foretold(path: Path) -> None:
-    """Draw what a log of each of 22 plants foretold, and what was walked."""
+    """Draw what a log of each of 20 plants foretold, and what was walked."""
     pairs = json.loads(FORETOLD.read_text())["pairs"]
-    plants = sorted({pair["seed"] for pair in pairs})[:22]
+    plants = sorted({pair["seed"] for pair in pairs if pair["far"]})[:20]
     cases = {
         traj: [
             (pair["foretold"]["L"], pair["walked"]["L"])
