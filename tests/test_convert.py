@@ -96,6 +96,19 @@ def test_solver_height_and_friction_are_mended_and_feet_may_have_names(tmp_path)
         np.testing.assert_allclose(ours, theirs, atol=1e-9)
 
 
+def test_gravity_is_that_of_the_file(tmp_path):
+    given = small(tmp_path)
+    path, text = given.write(), given.model.read_text()
+    assert "gravity" not in standard(given).text  # MuJoCo's own
+    for gravity in (3.7, 9.80665):
+        given.model.write_text(replaced(text, ("<option", f'<option gravity="0 0 -{gravity}"')))
+        robot = load_robot(converted(path, tmp_path / f"on{gravity}"))
+        np.testing.assert_array_equal(robot.gravity, [0.0, 0.0, gravity])
+        assert dict(dict(robot.description.control)["mpc"])["max_force"] == pytest.approx(
+            2.5 * robot.mass * gravity, rel=0.05
+        )
+
+
 @pytest.mark.parametrize("world", [False, True])
 def test_a_urdf_is_the_robot_that_its_numbers_are(tmp_path, world):
     hector, given = HECTOR, by_numbers(tmp_path, urdf_of(HECTOR, world))

@@ -81,8 +81,11 @@ def rebuild(path: Path, draft: Draft, pieces: Pieces, name: str) -> tuple[str, d
     """
     root = ElementTree.fromstring(_SCENE)
     root.set("model", name)
-    world = root.find("worldbody")
+    world, option = root.find("worldbody"), root.find("option")
     assert world is not None
+    assert option is not None
+    if not np.array_equal(gravity := pieces.file.model.opt.gravity, mujoco.MjOption().gravity):
+        option.set("gravity", _text(gravity))
     contact, motors, keys = (_add(root, tag) for tag in ("contact", "actuator", "keyframe"))
     count, bodies = draft.count, []
     for index, link in enumerate(pieces.links):
