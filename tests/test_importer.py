@@ -435,6 +435,34 @@ def test_a_draft_has_all_that_its_model_needs(monkeypatch, capsys, tmp_path):
         load_robot(draft)
 
 
+@pytest.mark.parametrize("fault", ["axis", "sole", "balance"])
+def test_a_draft_that_is_mended_is_the_robot_whose_model_never_was_wrong(
+    monkeypatch, capsys, tmp_path, fault
+):
+    change = {
+        "axis": ('right_knee" axis="0 1 0"', 'right_knee" axis="0 -1 0"'),
+        "sole": ('(?s)(right_foot.*?)size="0.06 0.03 0.01"', r'\1size="0.09 0.03 0.01"'),
+        "balance": ('pos="0.01 0 0.05" mass="4"', 'pos="1 0 0.05" mass="4"'),
+    }[fault]
+    sound = edited(tmp_path).read_text()
+    assert call(monkeypatch, "robot", tmp_path / "robot.xml", "--out", tmp_path / "sound") == 0
+    path, draft = edited(tmp_path, change), tmp_path / "draft" / "robot.toml"
+    assert call(monkeypatch, "robot", path, "--out", draft.parent) == 2
+    table = tomllib.loads(draft.read_text())
+    assert {*table} == {"name", "model", "joints"}
+    assert table["joints"] == proposed(tmp_path / "sound" / "robot.toml").table["joints"] | {
+        "weld": ["waist", "shoulder"]
+    }
+    assert call(monkeypatch, "robot", path) == 2  # what is printed is the same
+    printed = capsys.readouterr().out
+    assert tomllib.loads(printed[printed.rindex("# Proposed") :]) == table
+    draft.with_name("robot.xml").write_text(sound)
+    assert call(monkeypatch, "robot", draft, "--out", tmp_path / "mended") == 0
+    for name in ("robot.toml", "robot.xml"):
+        texts = [(tmp_path / x / name).read_text().split("\n", 1)[1] for x in ("sound", "mended")]
+        assert texts[0] == texts[1]
+
+
 def test_wrenches_act_in_the_middle_of_a_sole_which_may_be_a_tilted_box(
     tmp_path,
 ):

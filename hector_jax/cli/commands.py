@@ -123,7 +123,8 @@ def run_robot(args: flags.Robot) -> None:
         next_step = "fix it, then: hector robot" if wrong else "walk with it: hector walk --robot"
         say(f"the proposal is in {out}; {next_step} {out / TOML}")
     elif proposal.filled:
-        print(f"\n{as_toml(proposal.table, comments)}", end="")
+        table = proposal.draft if proposal.wrong else proposal.table
+        print(f"\n{as_toml(table, comments)}", end="")
     if wrong:
         raise InputError(wrong[-1])
 

@@ -77,6 +77,7 @@ class RobotProposal(NamedTuple):
     """The proposed TOML of a file, as far as its rules go."""
 
     table: dict[str, Any]  # beside the file as it is published
+    draft: dict[str, Any]  # of the table only what stays when the model is mended
     wrong: tuple[str, ...] = ()  # one line per problem to correct by hand
     guesses: tuple[str, ...] = ()  # one line per number that the file does not have
     filled: Sequence[str] = ()  # keys that the file does not have, which are proposed
@@ -105,7 +106,7 @@ def propose_robot(path: Path, folder: Path, weld: Sequence[str] = ()) -> RobotPr
             raise InputError(f"--weld is for a model; in {path} write joints.weld")
     model_name(path, own)
     stem = "".join(x if x.isalnum() or x in "-_" else "-" for x in path.stem)
-    first, wrong = RobotProposal({"name": stem, **own}), []
+    first, wrong = RobotProposal({"name": stem, **own}, draft={"name": stem, **own}), []
     found = first
     try:
         for stage in _stages(path, folder / MODEL, first, weld, wrong):
@@ -185,7 +186,7 @@ def files_of(proposal: RobotProposal, path: Path, comments: Sequence[str]) -> di
     """Return the files of a folder of its own for a robot, by name.
 
     They are the robot in the standard form; or, if something is wrong, a draft of it with all that
-    its model includes, and its meshes.
+    its model includes, and its meshes. A draft has no numbers of the model, which is to be mended.
 
     Args:
         proposal: of the robot.
@@ -197,7 +198,7 @@ def files_of(proposal: RobotProposal, path: Path, comments: Sequence[str]) -> di
         text = proposal.standard.text.encode() if proposal.standard else source.read_bytes()
         table, files = table | {"model": MODEL}, {MODEL: text}
     else:
-        table, files = proposal.table, {}
+        table, files = proposal.draft, {}
         with suppress(InputError):  # told already
             files = resolved(source)
     return {TOML: as_toml(table, comments).encode(), **files}
@@ -223,7 +224,8 @@ def _with_legs(survey: Survey, found: RobotProposal) -> RobotProposal:
     legs = zip(FEET[len(survey.legs)], survey.legs, strict=True)
     joints: dict[str, Any] = {x: [survey.file.joints[j] for j in leg] for x, leg in legs}
     joints |= {"weld": list(survey.weld)} if survey.weld else {}
-    return found._replace(survey=survey, table=_merged({"joints": joints}, found.table))
+    table = _merged({"joints": joints}, found.table)
+    return found._replace(survey=survey, table=table, draft=table)
 
 
 def _with_feet(found: RobotProposal, wrong: list[str]) -> RobotProposal:
@@ -235,16 +237,18 @@ def _with_feet(found: RobotProposal, wrong: list[str]) -> RobotProposal:
     if len(soles[0].contacts) == 1:  # a round foot, whose contact moves when the leg bends
         soles = find_soles(survey, angles)
         angles, balanced = standing_pose(survey, soles, angles)
+    feet, draft = zip(FEET[len(soles)], (sole.section for sole in soles), strict=True), found.draft
+    table = {"standing": angles, "joints": {}, "feet": dict(feet)} | found.table
     if "feet" not in found.table:
         found = found._replace(guesses=(*found.guesses, *_sole_lines(soles)))
+        if soles[0].guessed:  # and to be corrected by hand
+            draft = draft | {"feet": table["feet"]}
     if not balanced and "standing" not in found.table:
         wrong.append(
             "no standing pose found with level soles and the centre of mass over the feet: correct "
-            "the angles of [standing]"
+            "the model, or write angles into [standing]"
         )
-    feet = dict(zip(FEET[len(soles)], (sole.section for sole in soles), strict=True))
-    table = {"standing": angles, "joints": {}, "feet": feet} | found.table
-    return found._replace(soles=soles, table=table)
+    return found._replace(soles=soles, table=table, draft=draft)
 
 
 def _sole_lines(soles: Sequence[Sole]) -> Iterator[str]:
