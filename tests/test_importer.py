@@ -245,7 +245,7 @@ def test_soles_are_measured_on_the_lowest_facets_of_meshes(monkeypatch, capsys, 
                 np.testing.assert_allclose(sole.contacts, expected.contacts, atol=2e-4)
                 np.testing.assert_allclose(sole.axes, expected.axes, atol=1e-6)
     assert call(monkeypatch, "robot", path) == 0
-    assert "fixed    soles measured on sole.msh" in capsys.readouterr().out
+    assert "changed  soles measured on sole.msh" in capsys.readouterr().out
 
 
 KNEE, PITCH = 'right_knee" axis="0 1 0" range="-0.1 ', 'right_pitch" axis="0 1 0'
@@ -416,7 +416,10 @@ def test_a_draft_has_all_that_its_model_needs(monkeypatch, capsys, tmp_path):
     draft = tmp_path / "draft" / "robot.toml"
     assert call(monkeypatch, "robot", path, "--out", draft.parent) == 2
     err = capsys.readouterr().err
-    assert f"the proposal is in {draft.parent}; fix it, then: hector robot {draft}" in err
+    assert (
+        f"the proposal is in {draft.parent}; fix it, then: hector robot {draft} --out FOLDER\n"
+        in err
+    )
     line = proposed(path).wrong[-1]
     assert err.endswith(f"hector: {line}\n")
     assert f"# To be fixed: {line}" in draft.read_text()
@@ -433,6 +436,47 @@ def test_a_draft_has_all_that_its_model_needs(monkeypatch, capsys, tmp_path):
     assert load_robot(tmp_path / "mended" / "robot.toml").toe == pytest.approx(0.06, abs=1e-3)
     with pytest.raises(InputError, match=f"hector robot {draft} --out FOLDER"):
         load_robot(draft)
+
+
+@pytest.mark.parametrize("suffix", ["xml", "toml"])
+def test_there_is_no_draft_of_a_model_that_cannot_be_read(monkeypatch, capsys, tmp_path, suffix):
+    path = edited(tmp_path)
+    text = path.read_text()
+    (tmp_path / "robot.toml").write_text(f'model = "{path.name}"\n')
+    included = text.replace("<asset>", '<include file="gone.xml"/><asset>')
+    for content, words in ((text[:900], "malformed XML"), (included, "<include> of 'gone.xml'")):
+        path.write_text(content)
+        assert (
+            call(monkeypatch, "robot", tmp_path / f"robot.{suffix}", "--out", tmp_path / "d") == 2
+        )
+        err = capsys.readouterr().err
+        assert re.search(f"hector: {path}: {words}[^\n]*\n$", err)
+        assert "fix it" not in err
+        assert not (tmp_path / "d").exists()
+
+
+def test_a_file_that_is_still_to_be_converted_is_not_approved(monkeypatch, capsys, tmp_path):
+    assert call(monkeypatch, "robot", edited(tmp_path), "--out", tmp_path / "new") == 0
+    own, new = tmp_path / "own.toml", tmp_path / "new" / "robot.toml"
+    own.write_text('model = "robot.xml"\n')
+    words = f"other commands refuse it: {tmp_path}/robot.xml: <mesh> of 'thigh.stl' is of another "
+    words += f"file; convert it: hector robot {own} --out FOLDER\n"
+    for path, count in ((own, 1), (new, 0)):
+        capsys.readouterr()
+        assert call(monkeypatch, "robot", path) == 0
+        printed = capsys.readouterr().out
+        assert (printed.count(words), printed.count("other commands")) == (count, count)
+    # where it is converted there is nothing to be told
+    assert call(monkeypatch, "robot", own, "--out", tmp_path / "once") == 0
+    assert "other commands" not in capsys.readouterr().out
+
+
+def test_legs_that_are_unlike_are_told_once(monkeypatch, capsys, tmp_path):
+    path = edited(tmp_path, ('right_knee" axis="0 1 0"', 'right_knee" axis="0 -1 0"'))
+    assert call(monkeypatch, "robot", path, "--out", tmp_path / "draft") == 2
+    printed, err = capsys.readouterr()
+    for text in (printed, err, (tmp_path / "draft" / "robot.toml").read_text()):
+        assert text.count("left_knee and right_knee are no mirror images") == 1
 
 
 @pytest.mark.parametrize("fault", ["axis", "sole", "balance"])
@@ -520,7 +564,8 @@ def test_a_proposal_is_printed_and_written_once_into_a_new_folder(monkeypatch, c
     assert "knees bend backwards" in table
     assert re.search(r"left_hip_yaw, right_hip_yaw +\+z yaw", table)
     assert "feet     line: " in table
-    assert "fixed   " in table
+    for title in ("fixed    no joint", "changed  "):
+        assert len(re.findall(f"(?m)^{title}", table)) == 1
     assert "wrong    nothing" in table
     assert tomllib.loads(text)["joints"]["left"][0] == "left_hip_yaw"
     model, out = edited(tmp_path), tmp_path / "other"

@@ -111,6 +111,9 @@ def run_robot(args: flags.Robot) -> None:
     with TemporaryDirectory() as folder:
         proposal = propose_robot(file, Path(folder), args.weld)
         lines, told, wrong = _looked_at(proposal)
+    if proposal.refused and out is None and not wrong:
+        convert = f"convert it: hector robot {file} --out FOLDER"
+        told.append(f"other commands refuse it: {proposal.refused}; {convert}")
     if file.suffix == ".toml" and proposal.filled:
         lines += section("left out", [f"{', '.join(proposal.filled)}: HECTOR's, by the rules"])
     print("\n".join([*lines, *section("wrong", [*told, *wrong])]))
@@ -120,8 +123,10 @@ def run_robot(args: flags.Robot) -> None:
     if out is not None:
         for name, content in files_of(proposal, file, comments).items():
             write_file(out / name, content)
-        next_step = "fix it, then: hector robot" if wrong else "walk with it: hector walk --robot"
-        say(f"the proposal is in {out}; {next_step} {out / TOML}")
+        next_step = f"walk with it: hector walk --robot {out / TOML}"
+        if wrong:
+            next_step = f"fix it, then: hector robot {out / TOML} --out FOLDER"
+        say(f"the proposal is in {out}; {next_step}")
     elif proposal.filled:
         table = proposal.draft if proposal.wrong else proposal.table
         print(f"\n{as_toml(table, comments)}", end="")
@@ -134,7 +139,10 @@ def _looked_at(proposal: RobotProposal) -> tuple[list[str], list[str], list[str]
     robot, standard, wrong = proposal.robot, proposal.standard, list(proposal.wrong)
     if robot is None:
         return [], list(proposal.guesses), wrong
-    lines = table_of(robot, proposal.table["joints"].get("weld", ()))
+    lines, told = (
+        table_of(robot, proposal.table["joints"].get("weld", ())),
+        remarks(robot, standard),
+    )
     if proposal.error is None:
         try:
             loss_of_robot(robot.description)
@@ -145,9 +153,10 @@ def _looked_at(proposal: RobotProposal) -> tuple[list[str], list[str], list[str]
             wrong.append(str(error))
     elif unlike := differences(robot)[:1]:  # why a robot of unlike legs does not stand
         wrong.append("; ".join([*unlike, wrong.pop()]))
+        told.remove(*unlike)
     measured = [f"soles measured on {', '.join(x.files)}" for x in proposal.soles[:1] if x.files]
-    lines += section("fixed", [*measured, *(standard.notes if standard else ())])
-    return lines, [*proposal.guesses, *remarks(robot, standard)], wrong
+    lines += section("changed", [*measured, *(standard.notes if standard else ())])
+    return lines, [*proposal.guesses, *told], wrong
 
 
 @run.register

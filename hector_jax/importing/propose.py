@@ -30,7 +30,7 @@ of mass m and height h:
 
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -53,6 +53,7 @@ from hector_jax.robot.description import (
     MAX_BYTES,
     Description,
     Joints,
+    convert_by,
     description_of,
     model_name,
 )
@@ -86,6 +87,7 @@ class RobotProposal(NamedTuple):
     standard: Standard | None = None  # None: it cannot be converted, or need not be
     robot: Robot | None = None  # in the standard form; None: it cannot be built
     error: str | None = None  # why the robot cannot be used
+    refused: str | None = None  # why other commands do not take a TOML file
 
 
 def propose_robot(path: Path, folder: Path, weld: Sequence[str] = ()) -> RobotProposal:
@@ -123,7 +125,9 @@ def _stages(
     """Yield what is found of a robot, more each time, and write its model in the standard form."""
     source, toml, own = path.parent / found.table["model"], path.with_suffix(".toml"), found.table
     with _told_of(source, model):
-        if robot := _in_standard_form(path, own):
+        robot, refused = _in_standard_form(path, own)
+        found = found._replace(refused=refused)
+        if robot:
             names = {key: x for key, x in HECTOR_NAMES.items() if key not in own}
             found = found._replace(table=own | names)
         else:
@@ -157,12 +161,14 @@ def _told_of(source: Path, model: Path) -> Iterator[None]:
         raise InputError(str(error).replace(str(model), str(source))) from error
 
 
-def _in_standard_form(path: Path, own: dict[str, Any]) -> Robot | None:
-    """Return the robot of a TOML file, None unless it is in the standard form and stands."""
-    if path.suffix == ".toml":
-        with suppress(InputError):
-            return robot_of(description_of(path, own))
-    return None
+def _in_standard_form(path: Path, own: dict[str, Any]) -> tuple[Robot | None, str | None]:
+    """Return the robot of a TOML file in the standard form that stands, or why it is none."""
+    if path.suffix != ".toml":
+        return None, None
+    try:
+        return robot_of(description_of(path, own)), None
+    except InputError as error:
+        return None, str(error).removesuffix(f"; {convert_by(path)}")
 
 
 def _description(toml: Path, found: RobotProposal, model: Path) -> Description:
@@ -192,15 +198,16 @@ def files_of(proposal: RobotProposal, path: Path, comments: Sequence[str]) -> di
         proposal: of the robot.
         path: file that it was made of.
         comments: first lines of the TOML.
+
+    Raises:
+        InputError: one line: there is no draft of a model that cannot be read.
     """
     table, source = _standard_table(proposal), path.parent / proposal.table["model"]
     if not proposal.wrong:
         text = proposal.standard.text.encode() if proposal.standard else source.read_bytes()
         table, files = table | {"model": MODEL}, {MODEL: text}
     else:
-        table, files = proposal.draft, {}
-        with suppress(InputError):  # told already
-            files = resolved(source)
+        table, files = proposal.draft, resolved(source)
     return {TOML: as_toml(table, comments).encode(), **files}
 
 
