@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 
 import mujoco
@@ -436,6 +437,33 @@ def test_a_draft_has_all_that_its_model_needs(monkeypatch, capsys, tmp_path):
     assert load_robot(tmp_path / "mended" / "robot.toml").toe == pytest.approx(0.06, abs=1e-3)
     with pytest.raises(InputError, match=f"hector robot {draft} --out FOLDER"):
         load_robot(draft)
+
+
+def test_a_draft_keeps_the_folder_of_meshes_that_are_not_there(monkeypatch, tmp_path):
+    """Of two meshes one is found; later the other one lies where the model has it."""
+    (tmp_path / "parts").mkdir()
+    write_box(tmp_path / "parts" / "one.stl", (1.0, 1.0, 1.0))
+    meshes = '<mesh name="one" file="one.stl"/><mesh name="two" file="sub/two.stl"/>'
+    for found in ({"one.stl"}, set()):
+        path = edited(
+            tmp_path,
+            ("<asset>", f"<asset>{meshes}"),
+            ("../meshes", "parts"),
+            ("0.004 0.004 0.001", "0 0.004 0.001"),
+        )
+        draft = tmp_path / f"draft{len(found)}"
+        assert call(monkeypatch, "robot", path, "--out", draft) == 2
+        root = ElementTree.parse(draft / path.name).getroot()
+        files = {x.get("name"): x.get("file") for x in root.iter("mesh") if x.get("file")}
+        assert files == {
+            "one": "meshes/one.stl" if found else "parts/one.stl",
+            "two": "parts/sub/two.stl",
+            "thigh": "parts/thigh.stl",
+            "arm": "/etc/passwd",
+        }
+        assert not [x for x in root.iter("compiler") if "meshdir" in x.attrib]
+        assert {x.name for x in draft.rglob("*.stl")} == found
+        (tmp_path / "parts" / "one.stl").unlink(missing_ok=True)
 
 
 @pytest.mark.parametrize("suffix", ["xml", "toml"])

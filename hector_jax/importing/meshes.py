@@ -138,7 +138,8 @@ def _of_mjcf(path: Path) -> Iterator[MeshGeom]:
 def resolved(path: Path) -> dict[str, bytes]:
     """Return a model that needs nothing outside its folder, and its meshes, by name there.
 
-    What it includes is in it, and it names the meshes where they are to be.
+    What it includes is in it, and it names the meshes where they are to be, and those that are not
+    found with the folder in which they are to be sought.
 
     Raises:
         InputError: it cannot be read.
@@ -149,7 +150,9 @@ def resolved(path: Path) -> dict[str, bytes]:
     compilers = [x for x in root.iter("compiler") if {*folders} & {*x.attrib}]
     folder = next((x.get("meshdir") or x.get("assetdir", "") for x in compilers), "")
     for part in root.iter("mesh"):
-        if file := _find(path, part.get(key, ""), folder):
+        if not (named := part.get(key)):
+            continue
+        if file := _find(path, named, folder):
             content, name = file.read_bytes(), f"meshes/{file.name}"
             while meshes.get(name, content) != content:  # another file of the same name
                 name = f"{name.removesuffix(file.suffix)}_{file.suffix}"
@@ -157,7 +160,9 @@ def resolved(path: Path) -> dict[str, bytes]:
             if key == "file":
                 part.set("name", part.get("name", file.stem))  # by default that of the file
             part.set(key, name)
-    for part, name in product(compilers if meshes else (), folders):
+        elif "://" not in named:
+            part.set(key, (Path(folder) / named).as_posix())
+    for part, name in product(compilers, folders):
         part.attrib.pop(name, None)
     return {path.name: ElementTree.tostring(root), **meshes}
 
