@@ -12,6 +12,7 @@ Bodies and joints without a name get one, by which descriptions and messages mea
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import NamedTuple
 
@@ -61,7 +62,8 @@ def read_file(path: Path) -> File:
     Raises:
         InputError: one line naming a body that loses its mass; or MuJoCo's error.
     """
-    root, whole = read_published(path), read_published(path)
+    root = read_published(path)
+    whole = deepcopy(root)
     spec, notes, removed = parsed(path, root)
     removed += _remove_meshes(path, spec)
     notes += repair_inertias(path, spec)
