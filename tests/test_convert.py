@@ -45,7 +45,15 @@ def test_a_model_that_has_the_form_is_left_bit_for_bit(path):
 
 NOT_STANDARD = {  # what is told of HECTOR's model with a change
     "option cone is 1, expected 0": ('cone="pyramidal"', 'cone="elliptic"'),
-    "contact bits or friction of geom": ('friction="0.1 ', 'friction="0.9 '),
+    "geom 'trunk' of body 'trunk' has friction 0.9, expected at most 0.2": (
+        'friction="0.1 ',
+        'friction="0.9 ',
+    ),
+    "geom 'trunk' .* has condim 3, expected 1": ('condim="1"', 'condim="3"'),
+    "a geom without a name of body 'left_thigh' has conaffinity 7, .* those of 5": (
+        '<geom name="left_thigh"',
+        '<geom conaffinity="7"',
+    ),
     "expected a motor of torque for each": ('forcerange="-67 67"', 'gear="2"'),
     "expected one floor": ('contype="1" conaffinity="0"', 'contype="1" conaffinity="1"'),
     "expected each joint in the origin": (

@@ -12,6 +12,7 @@ each other. Friction and stiffness are those of the floor.
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -114,23 +115,32 @@ def _not_of_world(description: Description, model: mujoco.MjModel) -> Iterator[s
     for g in map(int, np.flatnonzero(collide & (model.geom_bodyid > 0))):
         link = int(model.geom_bodyid[g]) - 1
         leg = (link - 1) // description.leg_joints if link else None
-        contype, conaffinity = contact_bits(len(description.feet), leg)
-        if (
-            model.geom_contype[g] & ~contype
-            or model.geom_conaffinity[g] & ~conaffinity
-            or model.geom_solmix[g]
-            or model.geom_priority[g]
-            or model.geom_condim[g] != (3 if model.geom(g).name in contacts else 1)
-            or model.geom_friction[g, 0] > _MOST_FRICTION
-            or model.geom_type[g] not in SHAPES
-        ):
-            yield f"contact bits or friction of geom {model.geom(g).name!r}"
+        geom, body = model.geom(g), model.body(link + 1).name
+        bits = contact_bits(len(description.feet), leg)
+        for text in _not_of_geom(geom, bits, 3 if geom.name in contacts else 1):
+            label = f"geom {geom.name!r}" if geom.name else "a geom without a name"
+            yield f"{label} of body {body!r} has {text}"
     for name, value in SOLVER.items():
         if (own := getattr(model.opt, name)) != value:
             yield f"option {name} is {own}, expected {float(value):g}"
     gravity = model.opt.gravity
     if np.any(gravity[:2]) or not gravity[2] < 0.0:
         yield f"gravity is {gravity}, expected 0 0 and a negative number"
+
+
+def _not_of_geom(geom: Any, bits: tuple[int, int], condim: int) -> Iterator[str]:
+    """Yield what a geom of the robot that collides has, and what it was expected to have."""
+    for name, allowed in zip(("contype", "conaffinity"), bits, strict=True):
+        if (own := int(getattr(geom, name)[0])) & ~allowed:
+            yield f"{name} {own}, expected no bits but those of {allowed}"
+    for name, expected in (("condim", condim), ("solmix", 0), ("priority", 0)):
+        if (own := getattr(geom, name)[0]) != expected:
+            yield f"{name} {own:g}, expected {expected}"
+    if (own := geom.friction[0]) > _MOST_FRICTION:
+        yield f"friction {own:g}, expected at most {_MOST_FRICTION}"
+    if (own := int(geom.type[0])) not in SHAPES:
+        names = [mujoco.mjtGeom(x).name.removeprefix("mjGEOM_").lower() for x in (own, *SHAPES)]
+        yield f"type {names[0]}, expected one of {listed(names[1:])}"
 
 
 def contact_bits(legs: int, leg: int | None, *, on_floor: bool = True) -> tuple[int, int]:
