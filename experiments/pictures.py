@@ -188,9 +188,8 @@ def draw_page(path: Path, run: Path) -> None:
 
 
 def draw_live(path: Path) -> None:
-    """Take a picture of the page of `hector view --live`, after eight seconds of walking."""
-    with _live_page({"nominal": nominal(), "shipped": shipped()}, 960) as (tab, go):
-        go(8.0)
+    """Take a picture of the page of `hector view --live`, after six seconds of walking."""
+    with _live_page({"nominal": nominal(), "shipped": shipped()}, 960) as (tab, _):
         Image.fromarray(tab.picture()).save(path, optimize=True)
 
 
@@ -206,14 +205,18 @@ def draw_live_film(path: Path) -> None:
     }
     frames: list[Image.Image] = []
     with _live_page({"shipped": shipped()}, 720) as (tab, go):
-        go(4.0)
         for frame in range(round(10.0 / _FRAME)):
             for due in [due for due in acts if due <= frame * _FRAME]:
                 acts.pop(due)(tab)
                 time.sleep(1.0)  # until the page has told the server
             go(_FRAME)
-            frames.append(Image.fromarray(tab.picture()).resize((800, 480)))
-    options: dict[str, Any] = {"duration": round(1e3 * _FRAME), "loop": 0, "quality": 60}
+            frames.append(Image.fromarray(tab.picture()).resize((720, 432)))
+    options: dict[str, Any] = {
+        "duration": round(1e3 * _FRAME),
+        "loop": 0,
+        "quality": 40,
+        "method": 6,
+    }
     frames[0].save(path, save_all=True, append_images=frames[1:], **options)
 
 
@@ -221,7 +224,9 @@ def draw_live_film(path: Path) -> None:
 def _live_page(
     sets: dict[str, Weights], height: int
 ) -> Iterator[tuple[Any, Callable[[float], None]]]:
-    """Open the page of a live walk in a browser; yields its tab, and a function that walks on.
+    """Open the page of a live walk in a browser and walk for six seconds.
+
+    Yields its tab, and a function that walks on.
 
     The walk waits for the browser, which draws slowly where there is no graphics card; its
     real-time factor is by the time of the processor.
@@ -232,8 +237,9 @@ def _live_page(
     plant, command = hfs(robot.description), named_command("straight")
     session = Session(robot, [Job(weights, command, plant) for weights in sets.values()])
     session.warm_up()
-    named, model = {"nominal": nominal(), "shipped": shipped()}, compile_model(robot.description)
-    setup = PageSetup(robot, model, sets, list(sets), named, "hfs", 0, lambda *_: "")
+    named = {"nominal": nominal(), "expert": expert(), "shipped": shipped()}
+    model, line = compile_model(robot.description), lambda *_: ""
+    setup = PageSetup(robot, model, sets, list(sets), named, "hfs", 0, line)
     with opened_server("127.0.0.1", 8765) as (server, address):
         page = LivePage(server, setup, _Direct(session), Tuner(None, robot))  # pyright: ignore
 
@@ -247,14 +253,15 @@ def _live_page(
                 if k % _TICKS == _TICKS - 1 or k == ticks - 1:
                     factor = min(seconds * (k + 1) / ticks / spent, 1.0)
                     page.show(Frame(*session.frame(), factor, wanted=1.0, compilations=0))
-            time.sleep(max(2.0 * seconds, 1.0))  # until it is drawn
+            time.sleep(1.0)  # until it is drawn
 
         with tempfile.TemporaryDirectory() as profile, opened(address, profile, height) as tab:
             go(0.1)
             while "Real-time factor" not in tab.text():
                 time.sleep(2.0)
-            time.sleep(20.0)  # the scene fades in
             tab.call("Runtime.evaluate", expression=CLOSE_NOTICES)
+            for _ in range(60):  # the scene fades in by frames
+                go(0.1)
             yield tab, go
 
 

@@ -96,9 +96,14 @@ def test_commands_of_a_page_parse_and_what_it_names_is_there(path, capsys):
             at = words.index("--config")
             del words[at : at + 2]
         try:
-            parse.from_line(words)
+            asked = parse.from_line(words)
         except SystemExit as left:  # after --help, too
             codes[line] = left.code
+            continue
+        given = (getattr(asked, flag, ()) for flag in ("weights", "start", "walked"))
+        for text in (x for one in given for x in ([one] if isinstance(one, str) else one)):
+            file = flags.named_file(str(text))[1]
+            assert file in flags.NAMED_WEIGHTS or Path(file).suffix or "/" in file, line
     assert not any(codes.values()), (codes, capsys.readouterr().err)
     text = path.read_text()
     named = set(re.findall(r"`hector ((?:(?:log|steps) )?[a-z]+)", text))

@@ -273,6 +273,7 @@ def test_plants_stop_to_walk_when_every_set_is_clear_and_go_on_later(
         "most_plants": 32,
         "walks": 16,
         "walks_saved": 48,
+        "baseline": "nominal",
         "claims": {"s": {"expert": "worse"}},
     }
     assert call(monkeypatch, *words) == 0

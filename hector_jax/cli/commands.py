@@ -163,6 +163,8 @@ def _looked_at(proposal: RobotProposal) -> tuple[list[str], list[str], list[str]
 def run_export(args: flags.Export) -> None:
     """Export the controller of a run, checked against the live one; or numbers of a file."""
     run = Run(args.run) if args.run.is_dir() else None
+    if args.is_given("set") and run is None:
+        raise InputError(f"--set is of a run, and {args.run} is weights")
     path = run.weights_file(args.set) if run else args.run
     folder = args.out or (args.run if run else args.run.parent) / "export"
     if args.template and args.into:

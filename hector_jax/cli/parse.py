@@ -118,9 +118,8 @@ def read_flags(kind: type[Flags], words: Sequence[str], program: str) -> Flags:
     words = [word for word in words if word not in _HELP]
     names = [word[2:].partition("=")[0].replace("_", "-") for word in words if word[:2] == "--"]
     given = [name.removeprefix("no-") for name in names]
-    for name in given:
-        if given.count(name) > 1:
-            raise InputError(f"--{name} is given twice")
+    if twice := [name for name in given if given.count(name) > 1]:
+        raise InputError(f"--{twice[0]} is given twice")
     if "config" in given:
         flags_of_line: Any = _quietly(kind, words, program, default)
         default = from_file(kind, flags_of_line.config)
@@ -333,20 +332,21 @@ def _check_source(label: str, value: Path | str, source: PathKind) -> None:
     text = named_file(str(value))[1] if is_named else str(value)
     path, named, is_dir = Path(text), text in NAMED_WEIGHTS, os.path.isdir(text)
     existing = next(x for x in (path, *path.parents) if os.path.exists(x))
+    given = named or path.suffix or os.path.lexists(path)
     valid, is_file = {
         PathKind.FILE: (True, True),
         **dict.fromkeys((PathKind.LOG, PathKind.BAG), (True, not is_dir)),
         PathKind.RUN: (is_dir, False),
         PathKind.FOLDER: (os.path.isdir(existing), False),
-        PathKind.EXPORTABLE: (True, not named and not is_dir),
-        PathKind.WEIGHTS: (named or path.suffix or os.path.lexists(path), not named),
+        PathKind.EXPORTABLE: (given, not named and not is_dir),
+        PathKind.WEIGHTS: (given, not named),
         PathKind.SETS: (named or is_dir or path.suffix, not named and not is_dir),
         PathKind.TRAJECTORY: (True, path.suffix == ".toml"),
         PathKind.MODEL: (text in OTHER_MASSES or path.suffix == ".toml", text not in OTHER_MASSES),
         PathKind.ROBOT: (path.suffix == ".toml", True),
     }[source]
     if not valid:
-        of_sets = source in (PathKind.WEIGHTS, PathKind.SETS)
+        of_sets = source in (PathKind.WEIGHTS, PathKind.SETS, PathKind.EXPORTABLE)
         renamed = {"best": "; that is `shipped` now, or weights/best.json of a run"}
         hint = renamed.get(text, did_you_mean(text, NAMED_WEIGHTS)) if of_sets else ""
         raise InputError(f"{label} must be {source.value}, got {one_line(str(value))!r}{hint}")

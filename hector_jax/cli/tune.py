@@ -192,7 +192,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
 
 def _carried(run: _Run, verdict: metrics.Verdict) -> Carried | None:
     """Return what `best` may bring on another robot; None if that was not measured: not HECTOR."""
-    return carry(verdict, "shipped") if run.setup.robot.description == describe() else None
+    return carry(verdict, "best") if run.setup.robot.description == describe() else None
 
 
 def _print(

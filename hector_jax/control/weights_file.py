@@ -56,7 +56,7 @@ def shipped(robot: Robot | None = None) -> Weights:
     toml = (HECTOR if robot is None else robot.description).path
     path = toml.with_name(f"{toml.stem}-shipped.json")
     if not path.exists():
-        raise InputError(f"weights shipped: no {path}; tune this robot and name a file of its run")
+        raise InputError(f"weights shipped: no {path}; name nominal, expert or a weights file")
     return load_weights(path, robot)
 
 

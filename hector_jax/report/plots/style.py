@@ -27,7 +27,7 @@ SETS = {
     "without": {"color": ORANGE, "linestyle": (0, (4, 1.2, 1, 1.2))},
     "with": {"color": GREEN, "linestyle": "-"},
     "best": {"color": "#1f2f8f", "linestyle": "-"},
-    "shipped": {"color": "#1f2f8f", "linestyle": (0, (5, 1, 1, 1))},
+    "shipped": {"color": "#5a1f8f", "linestyle": (0, (5, 1, 1, 1))},
 }
 """Lines of the package's weight sets; `looks_of` returns a look for any set."""
 
