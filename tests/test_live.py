@@ -194,6 +194,9 @@ def test_a_page_shows_what_the_walk_is_at_and_turns_undoes_and_saves_weights(mon
         page._weights._file.value = "../there.json"
         page._weights._save()
         assert not (tmp_path.parent / "there.json").exists()
+        page._reset()
+        page.show(Frame(*found.frame(), 1.0, 1.0, 0))  # before t = 0
+        assert not page._strips[0]
         page._ask("step")
         page.tune(found.log(0))
         assert page._found.content.startswith("Not yet: ")

@@ -258,7 +258,8 @@ class LivePage:
             for now, handles in zip(frame.walks, self._handles, strict=True):
                 self._draw(now, handles)
         for strip, now in zip(self._strips, frame.walks, strict=True):
-            if not strip or now.time > strip[-1][0]:
+            # before the path begins there is no error, and with a NaN the page draws no line at all
+            if np.isfinite(now.error).all() and (not strip or now.time > strip[-1][0]):
                 off = np.hypot(*now.error[:2]), np.hypot(*now.error[3:5])
                 strip.append((now.time, *off))
                 while strip[0][0] < now.time - _STRIP:
