@@ -139,10 +139,8 @@ def _looked_at(proposal: RobotProposal) -> tuple[list[str], list[str], list[str]
     robot, standard, wrong = proposal.robot, proposal.standard, list(proposal.wrong)
     if robot is None:
         return [], list(proposal.guesses), wrong
-    lines, told = (
-        table_of(robot, proposal.table["joints"].get("weld", ())),
-        remarks(robot, standard),
-    )
+    lines = table_of(robot, proposal.table["joints"].get("weld", ()))
+    told = remarks(robot, standard)
     if proposal.error is None:
         try:
             loss_of_robot(robot.description)
@@ -153,7 +151,7 @@ def _looked_at(proposal: RobotProposal) -> tuple[list[str], list[str], list[str]
             wrong.append(str(error))
     elif unlike := differences(robot)[:1]:  # why a robot of unlike legs does not stand
         wrong.append("; ".join([*unlike, wrong.pop()]))
-        told.remove(*unlike)
+        told = [line for line in told if line not in unlike]
     measured = [f"soles measured on {', '.join(x.files)}" for x in proposal.soles[:1] if x.files]
     lines += section("changed", [*measured, *(standard.notes if standard else ())])
     return lines, [*proposal.guesses, *told], wrong
