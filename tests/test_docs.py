@@ -604,6 +604,13 @@ def laboratory():
         yield page, "from {} to {:.0f} or {:.0f}".format(before, *plane)
 
 
+def held_of(pairs, group):
+    """Number of the pairs whose interval, by the errors of a group, holds what was walked."""
+    known = foretell.calibrated(group)["L"]
+    ends = [(foretell.interval(x["foretold"]["L"], known), x["walked"]["L"]) for x in pairs]
+    return sum(low <= came <= high for (_, low, high), came in ends)
+
+
 def other_pages():
     """Figures of paper, notes, late motors, and of the delay that a robot bears."""
     losses = report("paper.json")["losses"]
@@ -622,6 +629,14 @@ def other_pages():
     yield DOCS / "howto" / "own.md", text.format(*cells)
     text = "from {:.1f} to {:.1f} cm on straight and from {:.1f} to {:.1f} on S; none fell"
     yield README, text.format(*cells[:4])
+    rolls = [
+        np.degrees([of[name]["rms"]["euler"][0] for name in ("expert", "best")])
+        for of in report("own_controller.json")["trajectories"].values()
+    ]
+    assert all(best > before for before, best in rolls)
+    yield README, "none fell, but they roll more"
+    ends = min(best for _, best in rolls), max(best for _, best in rolls)
+    yield DOCS / "howto" / "own.md", "roll grew to {:.1f} to {:.1f}°".format(*ends)
     found, cells = report("own_numbers.json"), []
     for of in found["trajectories"].values():
         cells.append(-of["best"]["change"]["start"]["median"])
@@ -633,30 +648,24 @@ def other_pages():
     of_two = found["with --walk-plants 2"]["trajectories"]
     assert {name: of["best"]["falls"] for name, of in of_two.items()} == {"straight": 0, "s": 3}
     yield DOCS / "howto" / "own.md", "With `--walk-plants 2` three fell on s."
+    walks_page = DOCS / "howto" / "walks.md"
     pairs = [pair for pair in report("foretell/standin.json")["pairs"] if pair["far"]]
-    known = foretell.calibrated(foretell.HERE)["L"]
-    ends = [(foretell.interval(x["foretold"]["L"], known), x["walked"]["L"]) for x in pairs]
-    held = sum(low <= came <= high for (_, low, high), came in ends)
-    text = f"{held} of {len(pairs)} intervals held what came; {0.9 * len(pairs):.0f} should"
-    yield DOCS / "howto" / "walks.md", text
+    text = f"On {len({x['seed'] for x in pairs})} plants {held_of(pairs, foretell.HERE)} of "
+    text += f"{len(pairs)} intervals held what came; {0.9 * len(pairs):.0f} should"
+    yield walks_page, text
     cases = report("foretell/cases.json")
     shifted = [pair for pair in cases["pairs"] if pair["world"] == "shifted"]
-    ends = [(foretell.interval(x["foretold"]["L"], known), x["walked"]["L"]) for x in shifted]
-    held = sum(low <= came <= high for (_, low, high), came in ends)
     text = "{refused} of {logs} logs were refused; of the".format(**cases["refused"]["shifted"])
-    yield DOCS / "howto" / "walks.md", f"{text} {len(shifted)} forecasts by the others {held} held"
+    held = held_of(shifted, foretell.HERE)
+    yield walks_page, f"{text} {len(shifted)} forecasts by the others {held} held"
     even = [pair for pair in cases["pairs"] if pair["world"] == "standin-even"]
-    for here, text in (
-        (True, "{} of {} logs were refused; {held} of {of} held"),
-        (False, "{held} of {of} f"),
-    ):
-        found = [x for x in even if ((x["robot"], x["engine"]) == ("hector", "c")) == here]
-        group = foretell.calibrated(foretell.HERE if here else foretell.ELSEWHERE)["L"]
-        ends = [(foretell.interval(x["foretold"]["L"], group), x["walked"]["L"]) for x in found]
-        held = sum(low <= came <= high for (_, low, high), came in ends)
-        logs = cases["refused"]["even"]
-        text = text.format(logs["refused"], logs["logs"], held=held, of=len(found))
-        yield DOCS / "howto" / "walks.md", text
+    here = [x for x in even if (x["robot"], x["engine"]) == ("hector", "c")]
+    text = "{refused} of {logs} logs were refused; ".format(**cases["refused"]["even"])
+    yield walks_page, f"{text}{held_of(here, foretell.HERE)} of {len(here)} held"
+    others = [x for x in even if x not in here]
+    assert len({x["robot"] for x in others} - {"hector"}) == 5
+    text = f"{held_of(others, foretell.ELSEWHERE)} of {len(others)} forecasts in Drake and "
+    yield walks_page, f"{text}Pinocchio and on five other robots"
     off = [x["walked"]["L"] - x["foretold"]["L"] for x in cases["pairs"] if x["robot"] == "own"]
     close = sum(abs(x) < 0.12 for x in off)
     text = (

@@ -284,6 +284,12 @@ def test_plants_stop_to_walk_when_every_set_is_clear_and_go_on_later(
     assert len(walked.jobs) == 64
 
 
+def test_without_nominal_claims_are_against_the_start(monkeypatch, capsys, walked):
+    words = "evaluate", "--traj", "s", "--seeds", 32, "--weights", "start=nominal", "mine=expert"
+    assert call(monkeypatch, *words, "--until-clear") == 0
+    assert ", against start: mine worse. Saved " in capsys.readouterr().out
+
+
 def test_each_engine_and_model_stops_where_it_is_clear(monkeypatch, capsys, walked):
     words = "evaluate", "--traj", "s", "c", "--plant", "heavy", "--other-seeds", 20, "--json"
     assert call(monkeypatch, *words, "--seeds", 16, "--until-clear") == 0

@@ -176,6 +176,11 @@ def test_a_page_shows_what_the_walk_is_at_and_turns_undoes_and_saves_weights(mon
         assert "0.40: **this machine is too slow** for speed 1" in page._status.content
         assert "**nominal**: 0.5 s; QP solved; " in page._status.content
         assert re.search(r"(left|right) \d+ N, \d+ % of friction", page._status.content)
+        shown = [cone for cone in page._handles[0]["cones"] if cone.visible]
+        assert shown
+        for cone in shown:  # the rim, by the friction of the floor
+            x, y, up = cone.points[4:].reshape(-1, 3).T
+            np.testing.assert_allclose(np.abs(x) + np.abs(y), PLANT.floor_friction * up, rtol=1e-6)
         assert "| **nominal** now | " in page._table.content
         slider = page._weights._sliders["Q_pitch"][0]
         assert slider.label == "Q_pitch = 50 1/rad²"

@@ -12,8 +12,8 @@ import numpy as np
 from hector_jax.cli import arguments
 from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import (
-    BASELINES,
     NAMED_WEIGHTS,
+    OF_ROBOT,
     OTHER_MASSES,
     Evaluate,
     WalkEngine,
@@ -38,8 +38,9 @@ from hector_jax.sim.world import Imperfections
 from hector_jax.store import tunings
 from hector_jax.store.run import Run
 from hector_jax.store.setup import Setup
-from hector_jax.verdict import judging, metrics
+from hector_jax.verdict import judging
 from hector_jax.verdict.matrix import OWN, Column, Columns, cells_of
+from hector_jax.verdict.metrics import BASELINES
 from hector_jax.verdict.stopping import StoppingRule
 
 _BATCH = 4  # plants between two looks of --until-clear: where it stops is no matter of the machine
@@ -204,10 +205,10 @@ def _sets(
     short = arguments.short_names([file for name, file in given if not name])
     files: dict[str, str] = {}
     for name, file in ((name or short[file], file) for name, file in given):
-        if name in files or (name in BASELINES and file != name):
+        if name in files or (name in OF_ROBOT and file != name):
             raise InputError(f"--weights {file}: there is a set {name!r} already; use NAME={file}")
         files[name] = file
-    if paired and (len(files) < 2 or not {*metrics.BASELINES} & {*files}):
+    if paired and (len(files) < 2 or not {*BASELINES} & {*files}):
         against = "nominal, expert or start=FILE, which changes are against, and other sets"
         raise InputError(f"--weights must have {against}")
 

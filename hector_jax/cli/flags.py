@@ -11,9 +11,9 @@ from hector_jax.core.settings import SEED, Range
 
 T = TypeVar("T")
 
-BASELINES = ("nominal", "expert")
+OF_ROBOT = ("nominal", "expert")  # sets that each robot has
 OTHER_MASSES = {"light": 0.9, "heavy": 1.1}  # models: the robot's own with all masses times this
-NAMED_WEIGHTS = (*BASELINES, "shipped")
+NAMED_WEIGHTS = (*OF_ROBOT, "shipped")
 
 
 class PathKind(Enum):
@@ -264,7 +264,7 @@ class Evaluate(Configured, ForRobot, ByWalker, Parallel, Printed):
 
     usual = frozenset("weights runs traj world engine plant seeds until_clear robot out".split())
     # nominal, expert, shipped, weights files, folders of straight.json, c.json, ...; or NAME=one
-    weights: tuple[WeightSets, ...] = BASELINES
+    weights: tuple[WeightSets, ...] = OF_ROBOT
     runs: tuple[Run, ...] = ()  # instead: finished runs of `hector tune`, side by side
     traj: Trajectories = ("straight",)  # names (all: straight, c and s) or TOML files
     world: PlantWorld = "standin"  # world of the plants; standin-even: masses drawn evenly

@@ -13,7 +13,7 @@ import numpy as np
 
 from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.arguments import print_result
-from hector_jax.cli.flags import BASELINES, Tune, Walk
+from hector_jax.cli.flags import OF_ROBOT, Tune, Walk
 from hector_jax.cli.parse import as_command, latest_run
 from hector_jax.cli.walker import tune_walker
 from hector_jax.control.parameters import step_names, tunables
@@ -225,7 +225,7 @@ def _check_start(run: _Run) -> None:
         InputError: the robot falls; the line has the likeliest cause and what to change.
     """
     setup, robot, text = run.setup, run.setup.robot, run.args.start
-    folder, at = run.folder / _ARTEFACTS, text if text in BASELINES else "start"
+    folder, at = run.folder / _ARTEFACTS, text if text in OF_ROBOT else "start"
     options: dict[str, Any] = {"folder": folder, "about": {"world": "hfs"}}
     for name, command in run.commands.items():
         case = name, at, 0
@@ -269,7 +269,7 @@ def _tune_sets(run: _Run, net: nets.TrainedNet) -> _Tuned:
     sets = {
         "nominal": nominal(setup.robot),
         "expert": expert(setup.robot),
-        **({} if run.args.start in BASELINES else {"start": run.start}),
+        **({} if run.args.start in OF_ROBOT else {"start": run.start}),
         **{name: tuning.weights for name, tuning in done.items()},
     }
     for name, weights in sets.items():  # a tuning on walks may be long: these can be used meanwhile

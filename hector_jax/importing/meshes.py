@@ -11,6 +11,7 @@ import re
 import struct
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Sequence
+from copy import deepcopy
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
@@ -22,7 +23,7 @@ from jaxtyping import Float
 from hector_jax.core.headless import mujoco
 from hector_jax.importing.elements import MESHES, compile_bare, parsed, repair_inertias
 from hector_jax.importing.links import Pose, pose_of, subtree
-from hector_jax.importing.published import read_published, read_whole
+from hector_jax.importing.published import read_whole
 from hector_jax.importing.survey import Survey
 from hector_jax.robot.poses import rotation_of
 
@@ -60,7 +61,7 @@ def foot_meshes(survey: Survey, data: mujoco.MjData) -> FootMeshes:
     """Return the vertices of the meshes of each foot in a pose of the survey's model."""
     path, model = survey.file.path, survey.file.model
     urdf = survey.file.root.tag == "robot"
-    geoms = list(_of_urdf(path) if urdf else _of_mjcf(path))
+    geoms = list(_of_urdf(path) if urdf else _of_mjcf(path, deepcopy(survey.file.root)))
     points, files, missing = [], [], []
     for leg in survey.legs:
         bodies = {model.body(b).name: b for b in subtree(model, int(model.jnt_bodyid[leg[-1]]))}
@@ -100,8 +101,7 @@ def _of_urdf(path: Path) -> Iterator[MeshGeom]:
             )
 
 
-def _of_mjcf(path: Path) -> Iterator[MeshGeom]:
-    root = read_published(path)
+def _of_mjcf(path: Path, root: ElementTree.Element) -> Iterator[MeshGeom]:
     spec, _, _ = parsed(path, root)
     repair_inertias(path, spec)
     meshes = {mesh.name: mesh for mesh in spec.meshes}

@@ -6,7 +6,6 @@
 The trunk's frame is at the trunk body's origin, x ahead, y left, z up.
 """
 
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -183,18 +182,18 @@ def compile_model(description: Description) -> mujoco.MjModel:
     Raises:
         InputError: as `build_model`.
     """
-    build_model(description)
-    return _read_spec(description)[1].compile()
+    return build_model(description, pictures=True)[1]
 
 
 def build_model(
-    description: Description, *, checked: bool = True
+    description: Description, *, checked: bool = True, pictures: bool = False
 ) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
-    """Return the spec of a description without pictures, which take half of the time to compile.
+    """Return the spec of a description, and its compiled model.
 
     Args:
         description: of the robot.
         checked: whether it must stand.
+        pictures: whether it keeps them; they take half of the time to compile.
 
     Returns:
         The spec; its compiled model.
@@ -204,23 +203,19 @@ def build_model(
             `mjcf.read_mjcf`, MuJoCo, `checks.check_form` or `checks.check_standing`.
     """
     with conversion(description.model):
-        root, spec = _read_spec(description)
-        for geom in spec.geoms:
-            geom.material = ""
-        for picture in (*spec.materials, *spec.textures):
-            spec.delete(picture)
+        root = read_mjcf(description.model, description.path)
         with mujoco_errors(description.model, root):
+            spec = mujoco.MjSpec.from_string(text_of(root))
+            if not pictures:
+                for geom in spec.geoms:
+                    geom.material = ""
+                for picture in (*spec.materials, *spec.textures):
+                    spec.delete(picture)
             model = spec.compile()
         check_form(description, model)
         if checked:
             check_standing(description, model)
     return spec, model
-
-
-def _read_spec(description: Description) -> tuple[ElementTree.Element, mujoco.MjSpec]:
-    root = read_mjcf(description.model, description.path)
-    with mujoco_errors(description.model, root):
-        return root, mujoco.MjSpec.from_string(text_of(root))
 
 
 def _legs(

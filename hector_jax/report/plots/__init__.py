@@ -252,7 +252,7 @@ def save_training(path: Path, history: History) -> str:
 
 
 def save_matrix(path: Path, cells: Cells, title_of: Callable[[Column], str]) -> str:
-    """Draw the change of L of every set against nominal, a row for each engine and model.
+    """Draw the change of L of every set against the baseline, a row for each engine and model.
 
     Args:
         path: file to write.
