@@ -216,6 +216,21 @@ def test_friction_in_a_box_and_twist_are_exported_too(tmp_path):
     assert_same(compare_with_live(config, ROBOT, library, recorded))
 
 
+@pytest.mark.parametrize("robot", [ROBOT, QUADRUPED], ids=["hector", "quadruped"])
+def test_the_inertia_of_the_motors_is_exported_too(tmp_path, robot):
+    needs_cc()
+    own = walk_config(robot)
+    armature = tuple(np.linspace(0.01, 0.02, len(own.legs.kp)).tolist())
+    config = replace(own, legs=replace(own.legs, armature=armature))
+    job = Job(nominal(robot), named_command("c"), ideal(robot.description), 0.4)
+    recorded = check.record(config, robot, job)
+    library = compile_controller(source_of(nominal(robot), config, robot), tmp_path)
+    assert_same(compare_with_live(config, robot, library, recorded))
+    (tmp_path / "plain").mkdir()  # a library is loaded once from a path
+    plain = compile_controller(source_of(nominal(robot), own, robot), tmp_path / "plain")
+    assert compare_with_live(config, robot, plain, recorded).torque > 0.1  # [N m]
+
+
 @pytest.fixture(scope="module")
 def held(tmp_path_factory):
     """exported_held.c with the shipped weights."""

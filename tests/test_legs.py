@@ -1,5 +1,6 @@
 """Torques and swing paths: virtual work, MuJoCo's statics, derivatives."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -11,6 +12,7 @@ from model import QUADRUPED, ROBOT, WEIGHT
 
 from hector_jax.control import LegConfig, Measurement, legs
 from hector_jax.control.footstep import Feet
+from hector_jax.control.legs import SwingTarget
 from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.trajectory import State, Wrench
 from hector_jax.robot.kinematics import foot_poses, leg_gravity
@@ -19,17 +21,18 @@ from hector_jax.robot.poses import standing_data
 
 CONFIG = LegConfig()
 SWING = 0.2
+HEAVY = (0.01, 0.02, 0.03, 0.02, 0.01)  # [kg m^2], motors of a leg
 STANDS = jnp.asarray(ROBOT.standing_joints)
 
 stance = jax.jit(lambda state, joints, wrench: legs.stance_torques(ROBOT, state, joints, wrench))
 path = jax.jit(lambda start, end, s: legs.swing_path(CONFIG.parameters, start, end, s))
 
 
-@jax.jit
-def targets(state, start, start_yaw, end, end_yaw, elapsed):
+@partial(jax.jit, static_argnums=6)
+def targets(state, start, start_yaw, end, end_yaw, elapsed, config=CONFIG):
     at, feet = Measurement(state, STANDS, 0 * STANDS), {"start": Feet(start, start_yaw)}
     feet["end"] = Feet(end, end_yaw)
-    return legs.swing_joints(ROBOT, CONFIG.parameters, at, **feet, elapsed=elapsed, swing=SWING)
+    return legs.swing_joints(ROBOT, config.parameters, at, **feet, elapsed=elapsed, swing=SWING)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -127,16 +130,16 @@ def test_a_swing_foot_rises_to_its_apex_halfway_and_is_slow_at_both_ends(step_up
     np.testing.assert_allclose(middle[:, 2], 0.0, atol=1e-3)
 
 
-def swing(elapsed, state=None, turn=0.3):
+def swing(elapsed, state=None, turn=0.3, config=CONFIG):
     state = base((0.0, 0.05, 0.1), (0.4, 0.1, 0.02)) if state is None else state
-    start_yaw = state.euler[2] + jnp.array([0.05, -0.1])
-    return targets(state, START, start_yaw, END, start_yaw + turn, jnp.asarray(elapsed, float))
+    yaw, elapsed = state.euler[2] + jnp.array([0.05, -0.1]), jnp.asarray(elapsed, float)
+    return targets(state, START, yaw, END, yaw + turn, elapsed, config)
 
 
 @pytest.mark.parametrize("elapsed", [0.04, 0.13, SWING + 0.01, 2 * SWING])
 def test_swing_joints_put_the_feet_on_the_path_and_an_overdue_foot_waits_at_its_end(elapsed):
     state = base((0.0, 0.05, 0.1))
-    joints, _ = swing([elapsed] * 2, state)
+    joints = swing([elapsed] * 2, state).angles
     position, R = world_feet(state, joints)
     s = min(elapsed / SWING, 1.0)
     np.testing.assert_allclose(position, path(START, END, jnp.full(2, s)), atol=1e-9)
@@ -150,15 +153,15 @@ def test_swing_rates_are_those_of_the_angles_and_half_a_turn_is_crossed_the_shor
 
     def at(time):
         moved = state._replace(position=state.position + time * state.velocity)
-        return np.asarray(swing([0.08 + time] * 2, moved)[0])
+        return np.asarray(swing([0.08 + time] * 2, moved).angles)
 
-    _, rates = swing([0.08] * 2, state)
+    rates = swing([0.08] * 2, state).rates
     np.testing.assert_allclose(rates, (at(step) - at(-step)) / (2 * step), atol=1e-6)
     assert np.abs(rates).max() > 1.0
     state = base((0.0, 0.0, np.pi))
     start_yaw, end_yaw = jnp.full(2, np.pi - 0.1), jnp.full(2, -np.pi + 0.1)
     turned = START * jnp.array([-1.0, -1.0, 1.0])
-    joints, _ = targets(state, turned, start_yaw, turned, end_yaw, jnp.full(2, SWING))
+    joints = targets(state, turned, start_yaw, turned, end_yaw, jnp.full(2, SWING)).angles
     np.testing.assert_allclose(np.asarray(joints)[::5], 0.1, atol=1e-9)
 
 
@@ -166,7 +169,8 @@ def test_stance_legs_push_and_swing_legs_follow_and_carry_their_weight():
     """A stance leg carries its own on request."""
     state, joints, rates = base((0.1, 0.2, 0.3)), STANDS + 0.1, jnp.linspace(-0.5, 0.5, 10)
     wrench = Wrench(jnp.array([[1.0, 2.0, 0.8 * WEIGHT], [0.0, 0.0, 0.0]]), jnp.zeros((2, 3)))
-    measurement, target = Measurement(state, joints, rates), (joints + 0.05, jnp.full(10, 0.2))
+    measurement = Measurement(state, joints, rates)
+    target = SwingTarget(joints + 0.05, jnp.full(10, 0.2))
     stands, configs = jnp.array([True, False]), (LegConfig(gravity_compensation=True), CONFIG)
     loaded, plain = (torques(one, measurement, stands, wrench, target) for one in configs)
     weight = carried(joints, jnp.asarray(ROBOT.gravity) @ rotation_from_euler(state.euler))
@@ -177,11 +181,27 @@ def test_stance_legs_push_and_swing_legs_follow_and_carry_their_weight():
     np.testing.assert_allclose([plain[5:], loaded[5:]], [pull + weight[5:]] * 2, atol=1e-9)
 
 
+def test_the_inertia_of_the_motors_is_fed_forward_where_it_is_given():
+    state, moving = base((0.0, 0.05, 0.1), (0.4, 0.1, 0.02)), replace(CONFIG, armature=HEAVY)
+    plain, target = (swing([0.08] * 2, state, config=config) for config in (CONFIG, moving))
+    assert plain.accelerations is None
+    np.testing.assert_allclose(target.angles, plain.angles, atol=1e-12)
+    np.testing.assert_allclose(target.rates, plain.rates, atol=1e-10)
+    later = state._replace(position=state.position + 1e-3 * state.velocity)
+    after = swing([0.081] * 2, later).rates
+    np.testing.assert_allclose(target.accelerations, (after - plain.rates) / 1e-3, atol=1e-6)
+    assert np.abs(target.accelerations).max() > 10.0
+    at = Measurement(state, plain.angles, plain.rates)
+    now = jnp.zeros(2, bool), Wrench(jnp.zeros((2, 3)), jnp.zeros((2, 3)))
+    more = torques(moving, at, *now, target) - torques(CONFIG, at, *now, plain)
+    np.testing.assert_allclose(more, np.tile(HEAVY, 2) * target.accelerations, atol=1e-9)
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_torques_stay_within_their_limits(sign):
     at_rest = Measurement(base(), STANDS, jnp.zeros(10))
     huge = Wrench(jnp.full((2, 3), 1e5 * sign), jnp.zeros((2, 3)))
-    far = STANDS + 9.0 * sign, jnp.zeros(10)
+    far = SwingTarget(STANDS + 9.0 * sign, jnp.zeros(10))
     for stands in (True, False):
         found = torques(CONFIG, at_rest, jnp.full(2, stands), huge, far)
         assert (np.abs(found) <= ROBOT.torque_limit).all()

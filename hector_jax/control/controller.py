@@ -117,10 +117,11 @@ def walk_config(robot: Robot) -> WalkConfig:
             f"numbers), got {short_repr(config.gait.pattern)}"
         )
     joints = robot.description.leg_joints
-    for name, gains in (("kp", config.legs.kp), ("kd", config.legs.kd)):
-        if len(gains) != joints:
+    of_joints = {name: getattr(config.legs, name) for name in ("kp", "kd", "armature")}
+    for name, gains in of_joints.items():
+        if len(gains) != joints and (gains or name != "armature"):
             raise InputError(
-                f"{path}: legs.{name} must be a gain for each of the {joints} joints of a leg, "
+                f"{path}: legs.{name} must be a number for each of the {joints} joints of a leg, "
                 f"got {short_repr(gains)}"
             )
     return config

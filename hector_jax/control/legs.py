@@ -2,11 +2,13 @@
 
 A stance leg pushes with tau = -J^T wrench, because the wrench is that of the ground on the robot
 (the paper prints no minus). A swing leg follows a smooth path from lift-off to touchdown by inverse
-kinematics and a joint PD with feedforward of the path's joint rates and the leg's weight. The
-target lies slightly below the ground so that the foot does land.
+kinematics and a joint PD with feedforward of the path's joint rates, of the leg's weight and, where
+it is given, of the motors' inertia: without that, legs with heavy motors lag behind, and each step
+lands short. The target lies slightly below the ground so that the foot does land.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -20,6 +22,7 @@ from hector_jax.core.geometry import rotation_from_euler, wrap_angle
 from hector_jax.core.settings import NOT_NEGATIVE, check
 from hector_jax.core.trajectory import State, Wrench
 from hector_jax.robot.kinematics import foot_jacobians, inverse_legs, leg_gravity
+from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 
 
@@ -38,6 +41,7 @@ class LegParameters(NamedTuple):
     landing: Any  # [m] target height at touchdown
     kp: Any  # (j,) [N m/rad] for the joints of a leg
     kd: Any  # (j,) [N m s/rad]
+    armature: Any  # (j,) [kg m^2] of the motors, at the joint; None: not fed forward
     gravity_compensation: Any  # share of the leg's own weight in the stance torque
 
 
@@ -49,16 +53,26 @@ class LegConfig:
     landing: float = -0.005  # [m] target height at touchdown
     kp: tuple[float, ...] = (60.0, 60.0, 60.0, 60.0, 20.0)  # [N m/rad] from hip yaw to ankle
     kd: tuple[float, ...] = (1.5, 1.5, 1.5, 1.5, 0.5)  # [N m s/rad]
+    armature: tuple[float, ...] = ()  # [kg m^2] of the motors, fed forward; empty: not
     gravity_compensation: bool = False  # add the leg's own weight to the stance torque
 
     def __post_init__(self) -> None:
-        check(self, height=NOT_NEGATIVE, kp=NOT_NEGATIVE, kd=NOT_NEGATIVE)
+        check(self, height=NOT_NEGATIVE, kp=NOT_NEGATIVE, kd=NOT_NEGATIVE, armature=NOT_NEGATIVE)
 
     @property
     def parameters(self) -> LegParameters:
         """The traced numbers."""
-        kp, kd = np.array(self.kp), np.array(self.kd)
-        return LegParameters(self.height, self.landing, kp, kd, float(self.gravity_compensation))
+        kp, kd, weight = np.array(self.kp), np.array(self.kd), float(self.gravity_compensation)
+        armature = np.array(self.armature) if self.armature else None
+        return LegParameters(self.height, self.landing, kp, kd, armature, weight)
+
+
+class SwingTarget(NamedTuple):
+    """Motion of the joints that moves swinging feet along their paths."""
+
+    angles: Float[Array, " joints"]  # [rad]
+    rates: Float[Array, " joints"]  # [rad/s]
+    accelerations: Float[Array, " joints"] | None = None  # [rad/s^2]; None: not fed forward
 
 
 def trunk_position(robot: Robot, state: State) -> Float[Array, "3"]:
@@ -102,11 +116,12 @@ def swing_joints(
     end: Feet,
     elapsed: Float[Array, " feet"],
     swing: float,
-) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
-    """Return joint angles [rad] and rates [rad/s] that move the feet along their swing paths.
+) -> SwingTarget:
+    """Return the motion of the joints that moves the feet along their swing paths.
 
     `elapsed` is the time since each foot's lift-off [s]. The rates are the derivative of the angles
-    along the path while the trunk continues with its current velocity.
+    along the path while the trunk continues with its current velocity; the accelerations are the
+    change of the rates in the next millisecond.
     """
     state = measurement.state
 
@@ -121,7 +136,13 @@ def swing_joints(
         up = jnp.broadcast_to(R_wb[2], local.shape)  # the soles are level
         return inverse_legs(robot, local, yaw, up, measurement.joints)
 
-    return jax.jvp(angles, (jnp.zeros(()),), (jnp.ones(()),))
+    def motion(time: Float[Array, ""]) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
+        return jax.jvp(angles, (time,), (jnp.ones(()),))
+
+    if parameters.armature is None:
+        return SwingTarget(*motion(jnp.zeros(())))
+    at, rates = jax.vmap(motion)(jnp.array([0.0, TIME_STEP]))
+    return SwingTarget(at[0], rates[0], (rates[1] - rates[0]) / TIME_STEP)
 
 
 def joint_torques(
@@ -131,17 +152,16 @@ def joint_torques(
     *,
     contact: Bool[Array, " feet"],
     wrench: Wrench,
-    target: tuple[Float[Array, " joints"], Float[Array, " joints"]],
+    target: SwingTarget,
 ) -> Float[Array, " joints"]:
-    """Return torques [N m] within the limits: stance legs push, swing legs follow the target.
-
-    The target is that of `swing_joints`, angles and rates.
-    """
+    """Return torques [N m] within the limits: stance legs push, swing legs follow the target."""
     state, joints, joint_rates = measurement
-    angles, rates = target
     weight = leg_gravity(robot, joints, robot.gravity @ rotation_from_euler(state.euler))
-    kp, kd = (jnp.tile(jnp.asarray(k), len(contact)) for k in (parameters.kp, parameters.kd))
-    swing = kp * (angles - joints) + kd * (rates - joint_rates) + weight
+    by_joint = partial(jnp.tile, reps=len(contact))
+    kp, kd = by_joint(jnp.asarray(parameters.kp)), by_joint(jnp.asarray(parameters.kd))
+    swing = kp * (target.angles - joints) + kd * (target.rates - joint_rates) + weight
+    if target.accelerations is not None:
+        swing += by_joint(jnp.asarray(parameters.armature)) * target.accelerations
     stance = stance_torques(robot, state, joints, wrench) + parameters.gravity_compensation * weight
     torque = jnp.where(jnp.repeat(contact, robot.description.leg_joints), stance, swing)
     return jnp.clip(torque, -robot.torque_limit, robot.torque_limit)

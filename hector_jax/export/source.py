@@ -205,6 +205,8 @@ def _tables(config: WalkConfig, robot: Robot) -> dict[str, Any]:
     tables |= {"LINK_MASS": robot.link_mass, "LINK_COM": robot.link_com}
     tables |= {"LOWER": robot.joint_lower.reshape(shape), "UPPER": robot.joint_upper.reshape(shape)}
     tables |= {"TORQUE_LIMIT": robot.torque_limit}
+    if config.legs.armature:
+        tables |= {"ARMATURE": np.array(config.legs.armature)}
     if config.footstep.rule != "paper":
         tables |= {"FOOT_AHEAD": robot.foot_ahead}
     if structure.closed_form:  # which takes its axes as exact

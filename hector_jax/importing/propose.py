@@ -17,6 +17,7 @@ of mass m and height h:
                              with which slow motors leave the joints a phase margin of 20 degrees
                              (`response`); at most 2 / rad times the torque limit
     kd                       sqrt(kp I)
+    armature                 that of the model
     inertia_share            that share which leaves the plan's attitude the same phase margin
     Q                        HECTOR's; for nominal 250 on the height
     R of forces, moments     times (m0 / m)^2, (m0 h0 / (m h))^2; for nominal times 0.3 as well
@@ -341,7 +342,7 @@ def _settings(robot: Robot) -> dict[str, Any]:
 
 
 def _gains(robot: Robot, answer: Response) -> dict[str, list[float]]:
-    """Return the gains of a leg's joints from the mean inertia and least torque of all legs."""
+    """Return gains and motors of a leg's joints from mean inertias and least torque of all legs."""
     legs = len(robot.foot_point)
     inertia = answer.inertia.reshape(legs, -1).mean(axis=0)
     limit = robot.torque_limit.reshape(legs, -1).min(axis=0)
@@ -349,7 +350,9 @@ def _gains(robot: Robot, answer: Response) -> dict[str, list[float]]:
     path = robot.description.model
     expect(path, np.isfinite(frequency), f"no gains hold the swing legs; {text}")
     kp = np.minimum(inertia * frequency**2, _KP_PER_LIMIT * limit)
-    return {"kp": [short(x) for x in kp], "kd": [short(x) for x in np.sqrt(kp * inertia)]}
+    motors = answer.armature.reshape(legs, -1).mean(axis=0)
+    of_joints = {"kp": kp, "kd": np.sqrt(kp * inertia), "armature": motors}
+    return {name: [short(x) for x in values] for name, values in of_joints.items()}
 
 
 def _weights(mass: float, size: float) -> dict[str, Any]:

@@ -133,7 +133,25 @@ def first_lines(verdict: Verdict, run: str) -> list[str]:
     tuned = "best" if "best" in verdict.scores else list(verdict.scores)[-1]
     errors = {name: plain_errors(verdict, name) for name in (tuned, *baselines(verdict))}
     falls = {name: int(summaries(verdict)[name].falls) for name in errors}
-    return render("first.txt.j2", verdict=verdict, errors=errors, falls=falls, run=run).splitlines()
+    worse = {scene: _worse(verdict.of_scene(scene), tuned) for scene in verdict.scenes}
+    values = {"verdict": verdict, "errors": errors, "falls": falls, "worse": worse, "run": run}
+    return render("first.txt.j2", **values).splitlines()
+
+
+def _worse(verdict: Verdict, tuned: str) -> list[str]:
+    """Say in what a tuned set is worse than the first baseline; of errors, by more than 5 %."""
+    if not (names := baselines(verdict)):
+        return []
+    of, than = (plain_errors(verdict, name) for name in (tuned, names[0]))
+    falls = [int(summaries(verdict)[name].falls) for name in (tuned, names[0])]
+    units = {"plane": "cm off in the plane", "pitch": "degrees in pitch"}
+    found = [
+        f"{of[error]:.1f} {unit}, {names[0]} {than[error]:.1f}"
+        for error, unit in units.items()
+        if of[error] > 1.05 * than[error]
+    ]
+    fell = f"{plural(falls[0], 'fall')}, {names[0]} {falls[1]}"
+    return found + [fell] * (falls[0] > falls[1])
 
 
 def elsewhere_line(carried: Carried) -> str:

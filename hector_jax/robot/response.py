@@ -44,6 +44,7 @@ class Response(NamedTuple):
     stance: Int[np.ndarray, " s"]  # feet
     held: tuple[int, ...]  # rows of a twist that the contacts of a foot hold
     inertia: Float[np.ndarray, " joints"]  # at each joint, the others locked [kg m^2]
+    armature: Float[np.ndarray, " joints"]  # its share that is of the motors
 
     @property
     def leg_joints(self) -> int:
@@ -101,6 +102,7 @@ def response(robot: Robot, stance: Sequence[int] | None = None) -> Response:
         stance=stands,
         held=held,
         inertia=M.diagonal()[6:],
+        armature=model.dof_armature[6:],
     )
 
 
