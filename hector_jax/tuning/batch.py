@@ -84,7 +84,9 @@ def lanes_of(backend: str) -> int:
     """Return the problems to compute in parallel on a device: 1 on a CPU, elsewhere all (0).
 
     In parallel, every tick waits for the slowest QP; a CPU gains nothing in return, as
-    `python -m benchmarks.batch --lanes 1 4 0` shows.
+    `python -m benchmarks.batch --lanes 1 4 0` shows. Where the cores are several devices it must be
+    1: XLA's pool has a thread for each, and batches of factorisations that begin together in it can
+    wait for ever (`core.numerics`).
     """
     return 1 if backend == "cpu" else 0
 
@@ -236,7 +238,8 @@ def tune_batch(
         problems: stacked, see `stack`; the same on every host.
         effects: phis, stacked too; `BatchScenario.effect` is the index into them.
         devices: on which to compute; None takes all.
-        lanes: problems in parallel on a device, 0 for all; None takes `lanes_of` the backend.
+        lanes: problems in parallel on a device, 0 for all; None takes `lanes_of` the backend, and
+            where a CPU is several devices there is no other number.
         walk: `rollout` or `parallel_rollout`; None takes `choose_rollout`.
         report_progress: takes the number of problems that have ended, the number of all problems
             and a message; see `console.bar`.
@@ -246,14 +249,17 @@ def tune_batch(
         `stop` is `Stop.BAD_START`.
 
     Raises:
-        ValueError: no problem, or an index of a phi, a delay or a share out of range.
+        ValueError: no problem, or an index of a phi, a delay, a share or `lanes` out of range.
     """
     count = _check_problems(config, problems, effects)
     devices = list(devices or jax.devices())
     problems_each = math.ceil(count / len(devices))
     rollouts = problems_each * np.shape(problems.scenarios.scale)[1]
     walk = walk or choose_rollout(devices[0].platform, config.rollout, rollouts)
-    lanes = lanes_of(devices[0].platform) if lanes is None else lanes
+    usual = lanes_of(devices[0].platform)
+    lanes = usual if lanes is None else lanes
+    if usual == 1 != lanes and len(jax.local_devices(backend="cpu")) > 1:
+        raise ValueError(f"lanes must be 1 where a CPU is several devices, got {lanes}")
     mesh = Mesh(np.array(devices), (AXIS,))
     robot, effects, problems = jax.tree.map(np.asarray, (robot, effects, problems))
     config = replace(config, loss=PAPER_LOSS)  # unused, and so one program for all losses
