@@ -70,9 +70,9 @@ def pin_options() -> None:
     # Its threads would wait for each other in small systems, and the number of cores would change
     # the rounding of results.
     threadpool_limits(1, user_api="blas")
-    # From jaxlib 0.10.0 to 0.11.0 a batch of factorisations waits in XLA's pool for its parts, which
-    # other threads of the pool compute: batches that begin together can wait for ever. A pool of
-    # one thread computes a batch where it begins, and our programs are no slower.
+    # From jaxlib 0.10.0 to 0.11.0 a batch of factorisations waits for parts of it that threads of
+    # XLA's pool compute: batches that begin together can wait in all of them, for ever. With one
+    # thread a batch is computed where it begins, and our programs are no slower.
     os.environ["PJRT_NPROC"] = "1"
     add_flags()
     values = (_defaults() if not_used() else {}) | PINNED
