@@ -9,7 +9,6 @@ have the names and the tolerances in common; how a commit computes a number is i
 """
 
 import argparse
-import os
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -283,10 +282,6 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", choices=SECTIONS, help="sections; all by default")
     flags = parser.parse_args()
     names = flags.only or list(SECTIONS)
-    # jaxlib 0.10.2 can hang where XLA's threads begin two batches of factorisations at once; a
-    # small program hangs with this flag too, so it is no proof against it
-    one_thread = "--xla_cpu_multi_thread_eigen=false"
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {one_thread}"
     setup_jax()
     found = {}
     for name in names:

@@ -153,7 +153,7 @@ def test_the_tail_is_the_mean_over_the_worst_share(tail, expected):
 
 
 DEVICES = """
-import numpy as np, jax
+import numpy as np, jax, pytest
 from functools import partial
 from experiments.lib import all_devices
 from hector_jax.core.runtime import setup_jax
@@ -168,6 +168,9 @@ assert len(jax.devices()) == 2
 # a program of another batch size may round otherwise
 close = partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-12)
 jax.tree.map(close, tuned(devices=jax.local_devices()[:1]), tuned())
+if len(jax.local_devices()) > 1:
+    with pytest.raises(ValueError, match="lanes must be 1 where a CPU is several devices, got 2"):
+        tuned(lanes=2)
 """
 
 

@@ -141,6 +141,35 @@ def test_importing_the_library_computes_nothing_and_linear_algebra_has_one_threa
     assert {x["num_threads"] for x in threadpool_info() if x["user_api"] == "blas"} <= {1}
 
 
+TWO_BATCHES = """
+from concurrent.futures import ThreadPoolExecutor
+from hector_jax.core.runtime import setup_jax
+setup_jax()
+import jax, numpy as np
+from hector_jax.qp import QP, QpConfig, solve_qp
+from hector_jax.qp.method import Solver
+config, rng = QpConfig(Solver.named("SOLVER")), np.random.default_rng(0)
+P, A, q = (rng.normal(size=(8, *shape)) for shape in ((60, 60), (100, 60), (60,)))
+qp = QP(P @ P.swapaxes(1, 2) + np.eye(60), q, A, -np.ones((8, 100)), np.ones((8, 100)))
+slope = jax.vmap(jax.grad(lambda q, qp: solve_qp(qp._replace(q=q), config).x.sum()))
+solve = jax.jit(slope).lower(q, qp).compile()
+with ThreadPoolExecutor(2) as threads:
+    for each in threads.map(lambda _: [solve(q, qp).sum() for _ in range(COUNT)], range(2)):
+        assert np.isfinite(each).all()
+"""
+
+
+@pytest.mark.parametrize(
+    ("solver", "count"),
+    [("interior_point", 20), pytest.param("jaxopt", 1, marks=pytest.mark.slow)],
+)
+def test_batches_of_factorisations_in_two_threads_do_not_wait_for_each_other(solver, count):
+    """With XLA's pool as it is, jaxlib 0.10.2 waited for ever in the first or second solve."""
+    program = TWO_BATCHES.replace("SOLVER", solver).replace("COUNT", str(count))
+    done = python("-c", program, env=USUAL, timeout=240)
+    assert done.returncode == 0, done.stderr
+
+
 YNN, EMITTERS = "--xla_cpu_experimental_ynn_fusion_type=", "--xla_cpu_use_fusion_emitters=false"
 BOTH = [("", "YNN EMITTERS"), ("--xla_a=1 word", "YNN EMITTERS --xla_a=1 word")]
 BOTH += [("YNNdot --xla_a=1", "EMITTERS YNNdot --xla_a=1"), ("flags.txt", "flags.txt")]

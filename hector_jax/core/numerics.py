@@ -62,7 +62,7 @@ _FLAGS = {
 def pin_options() -> None:
     """Give JAX's options the values that programs are made for; call before the first array.
 
-    Linear algebra on a CPU (NumPy's too) gets one thread.
+    Linear algebra on a CPU (NumPy's too) gets one thread, and so does XLA's pool.
     """
     import jax
     import scipy.linalg  # noqa: F401  # loads the LAPACK that XLA calls
@@ -70,6 +70,10 @@ def pin_options() -> None:
     # Its threads would wait for each other in small systems, and the number of cores would change
     # the rounding of results.
     threadpool_limits(1, user_api="blas")
+    # From jaxlib 0.10.0 to 0.11.0 a batch of factorisations waits for parts of it that threads of
+    # XLA's pool compute: batches that begin together can wait in all of them, for ever. With one
+    # thread a batch is computed where it begins, and our programs are no slower.
+    os.environ["PJRT_NPROC"] = "1"
     add_flags()
     values = (_defaults() if not_used() else {}) | PINNED
     for name in jax.config.values:  # which differ between versions

@@ -36,7 +36,7 @@ from hector_jax.tuning.evaluate import Evaluation, Walk, evaluate
 from hector_jax.tuning.loss import PAPER_LOSS, Loss
 from hector_jax.tuning.parallel_rollout import parallel_rollout
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
-from hector_jax.tuning.status import StepStatus, Stop
+from hector_jax.tuning.status import Stop
 from hector_jax.tuning.variation import Variation
 
 AXIS = "problems"
@@ -84,7 +84,9 @@ def lanes_of(backend: str) -> int:
     """Return the problems to compute in parallel on a device: 1 on a CPU, elsewhere all (0).
 
     In parallel, every tick waits for the slowest QP; a CPU gains nothing in return, as
-    `python -m benchmarks.batch --lanes 1 4 0` shows.
+    `python -m benchmarks.batch --lanes 1 4 0` shows. Where the cores are several devices it must be
+    1: XLA's pool has a thread for each, and batches of factorisations that begin together in it can
+    wait for ever (`core.numerics`).
     """
     return 1 if backend == "cpu" else 0
 
@@ -124,39 +126,27 @@ def _evaluate(
     problem: BatchProblem,
     state: TuneState,
 ) -> tuple[Evaluation, Float[Array, "n n"]]:
-    """Evaluate all scenarios of a problem as one; also return the matrix, where it is needed."""
+    """Evaluate all scenarios of a problem as one; also return the matrix, zero without a need."""
     config, lanes, walk, _ = program
     single = all(len(leaf) == 1 for leaf in jax.tree.leaves(effects))
     weights = difftune.trial_weights(config, state)
 
-    def over_scenarios(function: Callable[[Scenario, Loss, Array], Any]) -> Any:
-        def of_scenario(of: BatchScenario) -> Any:
-            effect = jax.tree.map(lambda leaf: leaf[0 if single else of.effect], effects)
-            scenario = Scenario(robot, of.command, of.anchor, effect, of.variation)
-            return function(scenario, of.loss, of.scale)
+    def slope(of: BatchScenario) -> tuple[Evaluation, Array]:
+        effect = jax.tree.map(lambda leaf: leaf[0 if single else of.effect], effects)
+        scenario = Scenario(robot, of.command, of.anchor, effect, of.variation)
+        shared = config.rollout, scenario, weights, of.loss
+        if config.rule == "gauss_newton":
+            found, matrix = least_squares(*shared, walk=walk, others=config.others)
+        else:
+            found, matrix = evaluate(*shared, walk=walk), jnp.zeros_like(state.rule.matrix)
+        loss, terms, gradient, matrix = jax.tree.map(lambda x: x / of.scale, (*found[:3], matrix))
+        return found._replace(loss=loss, terms=terms, gradient=gradient), matrix
 
-        return _map(lanes, of_scenario, problem.scenarios)
-
-    def value(scenario: Scenario, loss: Loss, scale: Array) -> Evaluation:
-        found = evaluate(config.rollout, scenario, weights, loss, walk=walk)
-        value, terms, gradient = jax.tree.map(lambda x: x / scale, found[:3])
-        return found._replace(loss=value, terms=terms, gradient=gradient)
-
-    def curvature(scenario: Scenario, loss: Loss, scale: Array) -> Array:
-        rollout, others = config.rollout, config.others
-        return least_squares(rollout, scenario, weights, loss, walk=walk, others=others)[1] / scale
-
-    stacked = over_scenarios(value)
+    stacked, matrices = _map(lanes, slope, problem.scenarios)
     weighted_sum = partial(jnp.tensordot, tail_weights(stacked.loss, problem.tail), axes=1)
-    loss, terms, gradient = jax.tree.map(weighted_sum, stacked[:3])
+    value, terms, gradient, matrix = jax.tree.map(weighted_sum, (*stacked[:3], matrices))
     fallen, residual = jnp.max(stacked.fallen), jnp.max(stacked.residual)
-    evaluation = Evaluation(loss, terms, gradient, fallen, residual)
-    none = jnp.zeros_like(state.rule.matrix)
-    if config.rule != "gauss_newton":
-        return evaluation, none
-    accepted = difftune.trial_status(config, state, evaluation) == StepStatus.ACCEPTED
-    matrix = lambda: weighted_sum(over_scenarios(curvature))  # noqa: E731
-    return evaluation, jax.lax.cond(accepted, matrix, lambda: none)
+    return Evaluation(value, terms, gradient, fallen, residual), matrix
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=COMPILER_OPTIONS)
@@ -236,7 +226,8 @@ def tune_batch(
         problems: stacked, see `stack`; the same on every host.
         effects: phis, stacked too; `BatchScenario.effect` is the index into them.
         devices: on which to compute; None takes all.
-        lanes: problems in parallel on a device, 0 for all; None takes `lanes_of` the backend.
+        lanes: problems in parallel on a device, 0 for all; None takes `lanes_of` the backend, and
+            where a CPU is several devices there is no other number.
         walk: `rollout` or `parallel_rollout`; None takes `choose_rollout`.
         report_progress: takes the number of problems that have ended, the number of all problems
             and a message; see `console.bar`.
@@ -246,14 +237,17 @@ def tune_batch(
         `stop` is `Stop.BAD_START`.
 
     Raises:
-        ValueError: no problem, or an index of a phi, a delay or a share out of range.
+        ValueError: no problem, or an index of a phi, a delay, a share or `lanes` out of range.
     """
     count = _check_problems(config, problems, effects)
     devices = list(devices or jax.devices())
     problems_each = math.ceil(count / len(devices))
     rollouts = problems_each * np.shape(problems.scenarios.scale)[1]
     walk = walk or choose_rollout(devices[0].platform, config.rollout, rollouts)
-    lanes = lanes_of(devices[0].platform) if lanes is None else lanes
+    usual = lanes_of(devices[0].platform)
+    lanes = usual if lanes is None else lanes
+    if usual == 1 != lanes and len(jax.local_devices(backend="cpu")) > 1:
+        raise ValueError(f"lanes must be 1 where a CPU is several devices, got {lanes}")
     mesh = Mesh(np.array(devices), (AXIS,))
     robot, effects, problems = jax.tree.map(np.asarray, (robot, effects, problems))
     config = replace(config, loss=PAPER_LOSS)  # unused, and so one program for all losses
