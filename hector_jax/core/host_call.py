@@ -1,8 +1,8 @@
 """Functions of the host that a compiled program on a CPU calls, by XLA's interface in C.
 
 JAX's own callbacks take several times as long, and no program with one goes into the compilation
-cache: here a program knows its function by a number alone. XLA refuses a handler of another major
-version of the interface.
+cache: here a program knows its function by a number alone. XLA refuses a handler for a version of
+the interface that is not compatible.
 
 Source: xla/ffi/api/c_api.h, in the folder of `jax.ffi.include_dir`.
 """
@@ -10,14 +10,14 @@ Source: xla/ffi/api/c_api.h, in the folder of `jax.ffi.include_dir`.
 import ctypes
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from ctypes import POINTER, Structure, c_double, c_int, c_int64, c_size_t, c_uint32, c_void_p
+from ctypes import POINTER, Structure, c_int, c_int32, c_int64, c_size_t, c_uint32, c_void_p
 from functools import cache
 from itertools import count
 from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from hector_jax.core.arrays import Array
 
@@ -74,22 +74,25 @@ class _Frame(Structure):
     )
 
 
-HostFunction = Callable[[np.ndarray, np.ndarray], None]
-_running: dict[float, Callable[[_Buffer, _Buffer], None]] = {}
-_numbers = count()
+_TYPES = {11: ctypes.c_float, 12: ctypes.c_double}  # by XLA's numbers
+_running: dict[int, Callable[[_Buffer, _Buffer], None]] = {}
+_interrupts: list[BaseException] = []
 
 
 @ctypes.CFUNCTYPE(c_void_p, POINTER(_Frame))
 def _handler(frame: Any) -> None:
-    now = frame.contents
-    if now.extension:  # XLA asks for the version when the handler is registered
-        metadata = now.extension.contents.metadata.contents
-        metadata.version.major, metadata.version.minor = _VERSION
-        metadata.traits = 0
-        return
-    number, x = now.inputs.buffers[:2]
-    function = _running[c_double.from_address(number.contents.data).value]
-    function(x.contents, now.outputs.buffers[0].contents)
+    try:
+        now = frame.contents
+        if now.extension:  # XLA asks for the version when the handler is registered
+            metadata = now.extension.contents.metadata.contents
+            metadata.version.major, metadata.version.minor = _VERSION
+            metadata.traits = 0
+            return
+        number, x = now.inputs.buffers[:2]
+        function = _running[c_int32.from_address(number.contents.data).value]
+        function(x.contents, now.outputs.buffers[0].contents)
+    except BaseException as error:  # a signal came before or after the function
+        _interrupts.append(error)
 
 
 @cache
@@ -99,22 +102,22 @@ def _register() -> str:
     return name
 
 
-def host_call(
-    number: Float[Array, "1"], x: Float[Array, " n"], size: int
-) -> Float[Array, " size"]:
-    """Call the function of a number from `serving` in a program with 64 bits on a CPU.
+def host_call(number: Int[Array, ""], x: Float[Array, " n"], size: int) -> Float[Array, " size"]:
+    """Call the function of a number from `serving`, as function(x, result), in a program on a CPU.
 
-    It is called as function(x, result) and writes into result. The program must use the result.
+    The function writes into result. XLA leaves a call out whose result is not used, and may make
+    one of two with the same inputs.
     """
     call = jax.ffi.ffi_call(_register(), jax.ShapeDtypeStruct((size,), x.dtype))
     return call(number, x)
 
 
 @contextmanager
-def serving(function: HostFunction) -> Iterator[Float[np.ndarray, "1"]]:
-    """Number a function that programs call while the context lasts; errors are raised at its end.
+def serving(function: Callable[[np.ndarray, np.ndarray], None]) -> Iterator[np.int32]:
+    """Number a function that programs call while the context lasts.
 
-    After an error it is not called again.
+    A program cannot raise: after an error the function is not called again, and the error is raised
+    at the end.
     """
     errors: list[BaseException] = []
     views: dict[int, np.ndarray] = {}  # by address: a loop passes the same memory in each turn
@@ -122,22 +125,23 @@ def serving(function: HostFunction) -> Iterator[Float[np.ndarray, "1"]]:
     def view(buffer: _Buffer) -> np.ndarray:
         address = buffer.data
         if address not in views:
-            memory = (c_double * buffer.shape[0]).from_address(address)
-            views[address] = np.frombuffer(memory)
+            memory = (_TYPES[buffer.dtype] * buffer.shape[0]).from_address(address)
+            views[address] = np.frombuffer(memory, _TYPES[buffer.dtype])
         return views[address]
 
     def guarded(x: _Buffer, result: _Buffer) -> None:
-        if not errors:
-            try:
-                function(view(x), view(result))
-            except BaseException as error:  # a program cannot raise it
-                errors.append(error)
+        if errors:
+            return
+        try:
+            function(view(x), view(result))
+        except BaseException as error:
+            errors.append(error)
 
-    number = float(next(_numbers))
-    _running[number] = guarded
+    number = next(n for n in count() if _running.setdefault(n, guarded) is guarded)
     try:
-        yield np.array([number])
+        yield np.int32(number)
     finally:
         del _running[number]
-    if errors:
-        raise errors[0]
+    if raised := [*_interrupts, *errors]:
+        _interrupts.clear()
+        raise raised[0]

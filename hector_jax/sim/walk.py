@@ -1,9 +1,9 @@
 """The closed loop in an engine that steps one plant: one walk, or many on several processes.
 
 Controller and sensing are compiled once per process and serve every walk, whatever its weights,
-command (of up to PIECES pieces), plant and engine: per tick one program plans, per millisecond one
-turns the plan into torques and the engine steps, and one program samples ten ticks. Inputs and
-outputs are packed into a few flat arrays, because the cost of a call grows with their number. A
+command (of up to PIECES pieces), plant and engine: per tick one program plans, one turns the plan
+into torques and calls the engine for each millisecond, and one program samples ten ticks. Inputs
+and outputs are packed into a few flat arrays, because the cost of a call grows with their number. A
 fall ends the walk: later samples repeat the last valid one and are marked as fallen.
 """
 
@@ -128,12 +128,11 @@ _planner = by_robot(_Planner)
 def _milliseconds(
     config: WalkConfig, of_state: Layout, shapes: tuple[tuple[int, ...], ...], *layouts: Layout
 ) -> Callable[..., Array]:
-    """Compile the milliseconds of a tick, from packed trees to the next state, packed.
+    """Compile the milliseconds of a tick, from packed trees to the next state, packed, on a CPU.
 
-    The program takes packed constants, plan and state, the reading now, and the errors of each
-    millisecond; `shapes` are those of the last two.
-
-    After the torques of each the program calls the host, which steps the plant and reads it.
+    The program takes constants, plan and state, all packed, the reading now and the errors of each
+    millisecond, whose shapes are given. After the torques of each millisecond it calls the host,
+    which steps the plant and reads it: a call of JAX for each would take as long as the step.
 
     XLA runs a kernel for each of a hundred operations and distributes them to its threads, which
     takes several times as long as the operations: a call marked as small is compiled into one
@@ -328,9 +327,6 @@ class Stepper:
         self._inputs.append(np.concatenate(parts))
         self._packed = planner.plan(self._constants, self._inputs[-1])
         self._plans.append(np.asarray(self._packed))
-        if self._milliseconds is None:
-            self._plan_layout = planner.layout
-            self._milliseconds = self._milliseconds_of(self._of_constants, planner.layout)
         steps = zip(self._readings[first + 1 :], forces, strict=False)
 
         def step(state: np.ndarray, result: np.ndarray) -> None:
@@ -340,6 +336,9 @@ class Stepper:
             result[:] = reading
 
         with serving(step) as host, jax.default_device(self._host):
+            if self._milliseconds is None:
+                self._plan_layout = planner.layout
+                self._milliseconds = self._milliseconds_of(self._of_constants, planner.layout)
             now = self._constants, self._plans[-1], self._state, reading, errors, host
             self._state = np.asarray(self._milliseconds(*now))
         self._yaw, self.clock = self._state[self._joints], self.clock + 1
