@@ -10,7 +10,7 @@ Source: xla/ffi/api/c_api.h, in the folder of `jax.ffi.include_dir`.
 import ctypes
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from ctypes import POINTER, Structure, c_int, c_int32, c_int64, c_size_t, c_uint32, c_void_p
+from ctypes import POINTER, Structure, c_char, c_int, c_int32, c_int64, c_size_t, c_uint32, c_void_p
 from functools import cache
 from itertools import count
 from typing import Any
@@ -74,7 +74,7 @@ class _Frame(Structure):
     )
 
 
-_TYPES = {11: ctypes.c_float, 12: ctypes.c_double}  # by XLA's numbers
+_TYPES = {11: np.dtype(np.float32), 12: np.dtype(np.float64)}  # by XLA's numbers
 _running: dict[int, Callable[[_Buffer, _Buffer], None]] = {}
 _interrupts: list[BaseException] = []
 
@@ -125,8 +125,9 @@ def serving(function: Callable[[np.ndarray, np.ndarray], None]) -> Iterator[np.i
     def view(buffer: _Buffer) -> np.ndarray:
         address = buffer.data
         if address not in views:
-            memory = (_TYPES[buffer.dtype] * buffer.shape[0]).from_address(address)
-            views[address] = np.frombuffer(memory, _TYPES[buffer.dtype])
+            dtype = _TYPES[buffer.dtype]
+            memory = (c_char * (buffer.shape[0] * dtype.itemsize)).from_address(address)
+            views[address] = np.frombuffer(memory, dtype)
         return views[address]
 
     def guarded(x: _Buffer, result: _Buffer) -> None:
