@@ -479,7 +479,7 @@ def robots():
         assert np.sum(falls) == falls[0][2] + falls[1][2]  # on S alone
         fell_text = "{}, then {}".format(*map(sum, falls)) if np.any(falls) else "none"
         pairs = errors.transpose(1, 0, 2)
-        cells = ["{:.1f} to {:.1f} cm, {:.1f} to {:.1f}".format(*pair.T.ravel()) for pair in pairs]
+        cells = ["{:.1f}/{:.1f}, {:.1f}/{:.1f}".format(*pair.T.ravel()) for pair in pairs]
         yield RESULTS, row(name, *cells, fell_text)
         if robot in ("go2", "h1", "humanoid"):
             off = ["{:.1f} to {:.1f} cm".format(*pairs[i][:, 0]) for i in (0, 2)]
@@ -488,6 +488,7 @@ def robots():
             yield README, row(name, *off, fell_text, str(worse))
             yield README, f"falls in {3 * plants} walks"
         yield RESULTS, f"on {plants} plants of `standin-even`"
+        yield RESULTS, f"falls in {3 * plants} walks"
     cells = 3 * len(ROBOTS)
     text = "error in the plane is lower in {} of {cells} cells, pitch in {}"
     yield RESULTS, text.format(*lower, cells=cells)
@@ -496,7 +497,7 @@ def robots():
     }
     more = [robot for robot, (before, after) in fell.items() if sum(after) > sum(before)]
     assert (more, len(fell) - len(more)) == (["anymal_c", "t1"], 4)
-    yield RESULTS, "fall less often for four robots and more often for two"
+    yield RESULTS, "four robots fall less often and two more often"
 
 
 def engines():
