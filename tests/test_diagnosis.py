@@ -2,17 +2,26 @@
 
 import json
 import re
+from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 from model import ROBOT
-from pretend import call, instead, pretend_walk
+from pretend import call, instead, pretend_score, pretend_walk
 
 from hector_jax import Job, WalkConfig, hfs, named_command, nominal, walk
+from hector_jax.cli import tune
+from hector_jax.cli.flags import Tune
+from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights_file import save_weights
+from hector_jax.core.inputs import InputError
 from hector_jax.sim import diagnosis
-from hector_jax.sim.diagnosis import Record, fall_of, likeliest_cause, not_the_weights
+from hector_jax.sim.diagnosis import Fall, Record, fall_of, likeliest_cause, not_the_weights
+from hector_jax.store.setup import Setup
+from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.verdict import judging
+from hector_jax.verdict.judging import ScoredWalk
 
 CONFIG = WalkConfig()
 JOB = Job(nominal(), named_command("straight"), hfs(), 1.0)
@@ -123,6 +132,31 @@ def test_a_start_that_falls_is_refused_before_anything_is_collected(monkeypatch,
     line = "--start weak.json cannot be tuned from: straight on the high-fidelity simulator fell at"
     assert line in capsys.readouterr().err
     assert not list(weak.glob("data/**/*.npz"))
+
+
+def test_a_start_that_falls_late_is_told_and_tuned_from(monkeypatch, tmp_path, capsys):
+    """A start that falls in the first half of each walk is refused."""
+    uprights = {"straight": 4.0, "s": 3.7}
+    trajectories = tuple(NamedCommand(name, named_command(name)) for name in uprights)
+
+    def score_jobs(setup, jobs, **options):
+        ((case, _),) = jobs.items()
+        upright = uprights[case[0]]
+        return {case: (ScoredWalk(pretend_score(1e6, upright < 4.0), upright, ""), None)}
+
+    def submit(function, *inputs):
+        return SimpleNamespace(result=lambda: Fall(3.7, 0.3, 0.8, "it slips"))
+
+    instead(monkeypatch, judging, "score_jobs", score_jobs)
+    setup = Setup(SimpleNamespace(submit=submit), TuneConfig(), ROBOT)
+    run = tune._Run(setup, tmp_path, Tune(), nominal(), trajectories)
+    tune._check_start(run)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("--start nominal is tuned from although s on the high-fidelity")
+    assert "fell after 3.70 s" in line
+    uprights |= {"straight": 1.9, "s": 0.4}
+    with pytest.raises(InputError, match="nominal cannot be tuned from: straight on the high"):
+        tune._check_start(run)
 
 
 def test_hector_walk_tells_the_fall_and_prints_no_nan(monkeypatch, weak, capsys):

@@ -185,6 +185,14 @@ def test_the_report_opens_with_errors_falls_and_the_next_step_and_says_below_whe
     assert lines[1].endswith("the tuning has not seen: with 0, nominal 0, expert 1.")
     assert all(f"`hector {name} latest`" in lines[2] for name in ("view", "export"))
     assert written(tmp_path, verdict).split("\n\n")[1:4] == lines
+    verdict = pretend_verdict(scenes=("c", "s"))
+    of = verdict.scores["with"]
+    far = of.rms_position * np.array([1.0, 3.0])[:, None]
+    fallen = of.fallen | (np.arange(8)[:, None] < [0, 2])
+    found = {"with": of._replace(rms_position=far, fallen=fallen)}
+    _, _, worse, after = report.first_lines(verdict._replace(scores=verdict.scores | found), "x")
+    assert worse.startswith("Worse on s: 6.7 cm off in the plane, nominal 2.2; 2 falls, nominal 0.")
+    assert after.startswith("Next")
     verdict = pretend_verdict()
     swapped = {"nominal": verdict.scores["with"], "with": verdict.scores["nominal"]}
     text = written(tmp_path, verdict._replace(scores=verdict.scores | swapped))
