@@ -12,12 +12,13 @@
     foretold      loss walked by loss foretold, with intervals
     race          loss by the number of walks, against CMA-ES and Bayesian optimisation
     robots        four robots walking
+    gallery       robots of one's own walking (needs their files: --robots NAME/robot.toml ...)
     page          the browser page of a run (needs Chromium and a run: --run)
     live          the browser page of a live walk (needs Chromium)
     live-film     ten seconds of it, in which a weight is turned and the robot pushed
 
-Walks are those of the first plant of the hardware stand-in, which no tuning has read; the robots of
-`robots` walk on the high-fidelity simulator.
+Walks are those of the first plant of the hardware stand-in, which no tuning has read; those of
+`robots` and `gallery` are on the high-fidelity simulator.
 """
 
 import json
@@ -25,7 +26,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -52,6 +53,7 @@ from hector_jax import (
 )
 from hector_jax.control.weights_file import shipped
 from hector_jax.core.console import exit_code, say
+from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import check
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.report.plots.style import drawing, label_of, looks_of
@@ -91,9 +93,12 @@ class Flags:
 
     names: tyro.conf.Positional[tuple[str, ...]] = ()  # pictures; all by default
     run: Path = Path("runs/straight")  # folder of a run of `hector tune`, for the page
+    robots: tuple[Path, ...] = ()  # TOML files, for the gallery
 
     def __post_init__(self) -> None:
         check(self, names=tuple(PICTURES))
+        if "gallery" in self.names and not self.robots:
+            raise InputError("gallery: --robots must name TOML files of robots, got none")
 
 
 def walk_of(robot: Robot, weights: Weights, plant: Imperfections, seconds: float) -> Trajectory:
@@ -156,10 +161,24 @@ def draw_robots(path: Path) -> None:
     for name in ("strider", "quadruped", "humanoid"):
         robot = load_robot(ROOT / "examples" / name / "robot.toml")
         tiles.append(_still(robot, nominal(robot), f"{name}: nominal"))
+    _paste(path, tiles, len(tiles))
+
+
+def draw_gallery(path: Path, robots: Sequence[Path]) -> None:
+    """Draw robots with plain weights, eight in a row, with the names of their folders."""
+    named = {file.parent.name: load_robot(file) for file in robots}
+    tiles = [_still(robot, nominal(robot), f"{name}: nominal") for name, robot in named.items()]
     width, height = tiles[0].size
-    picture = Image.new("RGB", (len(tiles) * (width + 4) - 4, height), "white")
+    _paste(path, [tile.resize((2 * width // 3, 2 * height // 3)) for tile in tiles], 8)
+
+
+def _paste(path: Path, tiles: Sequence[Image.Image], columns: int) -> None:
+    """Write a picture of tiles of one size, row by row."""
+    width, height = (size + 4 for size in tiles[0].size)
+    rows = -(-len(tiles) // columns)
+    picture = Image.new("RGB", (columns * width - 4, rows * height - 4), "white")
     for i, tile in enumerate(tiles):
-        picture.paste(tile, (i * (width + 4), 0))
+        picture.paste(tile, (i % columns * width, i // columns * height))
     picture.save(path, optimize=True)
 
 
@@ -321,6 +340,7 @@ PICTURES: dict[str, tuple[Path, Callable[[Path], None] | None]] = {
     "foretold": (OUT / "foretold.png", draw_foretold),
     "race": (OUT / "race.png", draw_race),
     "robots": (OUT / "robots.png", draw_robots),
+    "gallery": (OUT / "gallery.png", None),  # takes the files too
     "page": (OUT / "page.png", None),  # takes the run too
     "live": (OUT / "live.png", draw_live),
     "live-film": (OUT / "live.webp", draw_live_film),
@@ -332,9 +352,11 @@ def main() -> None:
     flags = tyro.cli(Flags, description=__doc__)
     setup_jax()
     OUT.mkdir(exist_ok=True)
-    for name in flags.names or PICTURES:
+    own = {"gallery": partial(draw_gallery, robots=flags.robots)}
+    own |= {"page": partial(draw_page, run=flags.run)}
+    for name in flags.names or [name for name in PICTURES if flags.robots or name != "gallery"]:
         path, draw = PICTURES[name]
-        (draw or partial(draw_page, run=flags.run))(path)
+        (draw or own[name])(path)
         say(f"{name}: {path}")
 
 

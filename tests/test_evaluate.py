@@ -5,13 +5,15 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
+from model import ROBOT
 from pretend import call, instead, pretend_history, pretend_score, pretend_walk, refused
 
 from hector_jax import PAPER_LOSS, InputError, expert, nominal
 from hector_jax.cli import evaluate as command
-from hector_jax.cli.flags import Tune
+from hector_jax.cli.flags import Evaluate, Tune
 from hector_jax.cli.parse import as_table
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.files import write_json
@@ -30,6 +32,10 @@ C, DRAKE, HEAVY = Column("c", "own"), Column("drake", "own"), Column("c", "heavy
 SETS = ("nominal", "expert", "with")
 
 
+def scaled(factor):
+    return nominal()._replace(Q=jax.tree.map(lambda x: factor * x, nominal().Q))
+
+
 def cell(seeds=8, fallen=(), nominal=4e6, tuned=1e6):
     """Walks of sets on plants of which the losses differ alike; `fallen` pairs of set and seed."""
     plant = 1.0 + 0.1 * np.arange(seeds)
@@ -38,6 +44,21 @@ def cell(seeds=8, fallen=(), nominal=4e6, tuned=1e6):
         for name, L in zip(SETS, (nominal, 3e6, tuned), strict=True)
     }
     return make_verdict(PAPER_LOSS, range(seeds), {"s": scores})
+
+
+def test_a_run_is_its_set_best_and_another_folder_has_a_file_for_each_trajectory(tmp_path):
+    run, each, levels = tmp_path / "run", tmp_path / "each", {"c": 2.0, "s": 3.0}
+    for folder in (run / "weights", each):
+        folder.mkdir(parents=True)
+    save_weights(run / "weights" / "best.json", scaled(1.5))
+    for trajectory, level in levels.items():
+        save_weights(each / f"{trajectory}.json", scaled(level))
+    args = Evaluate(weights=("nominal", str(run), f"mine={each}"))
+    sets = command._sets(args, ROBOT, levels, paired=True)
+    for trajectory, level in levels.items():
+        assert [*sets[trajectory]] == ["nominal", "run", "mine"]
+        for name, factor in (("run", 1.5), ("mine", level)):
+            jax.tree.map(np.testing.assert_allclose, sets[trajectory][name].Q, scaled(factor).Q)
 
 
 def test_cells_below_and_clear_and_void_are_counted():

@@ -195,7 +195,7 @@ def _installed() -> dict[str, Engine]:
 def _sets(
     args: Evaluate, robot: Robot, trajectories: Iterable[str], *, paired: bool
 ) -> dict[str, dict[str, Weights]]:
-    """Load the weight sets of each trajectory; a folder has one file per trajectory.
+    """Load the weight sets of each trajectory; a folder is a run or has a file per trajectory.
 
     Raises:
         InputError: a name is repeated; a file is not a weight set; or, where claims are made of
@@ -214,7 +214,8 @@ def _sets(
 
     def load(file: str, trajectory: str) -> Weights:
         if file not in NAMED_WEIGHTS and Path(file).is_dir():
-            file = str(Path(file, f"{trajectory}.json"))
+            of_run = Path(file, "weights", "best.json")
+            file = str(of_run if of_run.exists() else Path(file, f"{trajectory}.json"))
         return arguments.weights_by_name(file, robot)
 
     return {

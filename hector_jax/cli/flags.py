@@ -259,11 +259,11 @@ class Add(ByMapping, Printed):
 class Evaluate(Configured, ForRobot, ByWalker, Parallel, Printed):
     """Compare weight sets on simulated robots, and say what may be claimed; or compare runs.
 
-    Example: hector evaluate --weights nominal expert with=runs/tuned --traj all --plant light heavy
+    Example: hector evaluate --weights nominal expert mine=runs/tuned --traj all --plant light heavy
     """
 
     usual = frozenset("weights runs traj world engine plant seeds until_clear robot out".split())
-    # nominal, expert, shipped, weights files, folders of straight.json, c.json, ...; or NAME=one
+    # nominal, expert, shipped, weights files, runs, folders of straight.json, c.json, ..; NAME=one
     weights: tuple[WeightSets, ...] = OF_ROBOT
     runs: tuple[Run, ...] = ()  # instead: finished runs of `hector tune`, side by side
     traj: Trajectories = ("straight",)  # names (all: straight, c and s) or TOML files
