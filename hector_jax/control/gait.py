@@ -6,7 +6,6 @@ this foot in the pattern. A switch tick belongs to the new stance. With zero `sw
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Annotated
 
 import jax.numpy as jnp
@@ -79,7 +78,7 @@ class GaitConfig:
         """Stance feet at each tick of a cycle."""
         return (np.arange(self.cycle)[:, None] + self._lead) % self.cycle < self.stance
 
-    @cached_property  # each tick of a walk looks it up
+    @property
     def most_contacts(self) -> int:
         """Largest number of feet in stance at once during the gait."""
         return int(self._stands.sum(axis=1).max())

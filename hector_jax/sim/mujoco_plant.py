@@ -38,7 +38,7 @@ class MujocoPlant(Plant):
         self._reading_index, self._on_step = sensing.coordinates(world), on_step
         # views that remain valid: each look-up in MjData costs half a microsecond
         self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
-        self._sensors, self._warnings = self.data.sensordata, self.data.warning.number
+        self._sensors = self.data.sensordata
         self._push = self.data.xfrc_applied[world.trunk, :3]
         self._flat = np.zeros(len(self._qpos) + len(self._qvel) + 1)
         self._coordinates = np.split(self._flat, [len(self._qpos), -1])
@@ -46,7 +46,7 @@ class MujocoPlant(Plant):
     @property
     def broken(self) -> bool:
         """Return whether MuJoCo warned."""
-        return bool(self._warnings.any())
+        return bool(self.data.warning.number.any())
 
     def step(self, torque: Float[np.ndarray, " joints"], push: Float[np.ndarray, "3"]) -> None:
         """See `Plant`."""

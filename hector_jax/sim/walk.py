@@ -1,9 +1,9 @@
 """The closed loop in an engine that steps one plant: one walk, or many on several processes.
 
 Controller and sensing are compiled once per process and serve every walk, whatever its weights,
-command (of up to PIECES pieces), plant and engine: per tick one program plans, one turns the plan
-into torques and calls the engine for each millisecond, and one program samples ten ticks. Inputs
-and outputs are packed into a few flat arrays, because the cost of a call grows with their number. A
+command (of up to PIECES pieces), plant and engine: per tick one program plans, per millisecond one
+turns the plan into torques and the engine steps, and one program samples ten ticks. Inputs and
+outputs are packed into a few flat arrays, because the cost of a call grows with their number. A
 fall ends the walk: later samples repeat the last valid one and are marked as fallen.
 """
 
@@ -27,7 +27,6 @@ from hector_jax.control.parameters import Parameters
 from hector_jax.control.reference import Anchor, anchor_at, standing_anchor, with_pieces
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
-from hector_jax.core.host_call import host_call, serving
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree import Layout, layout, pack, unpack
 from hector_jax.robot.mjcf import TIME_STEP
@@ -125,50 +124,34 @@ _planner = by_robot(_Planner)
 
 
 @by_robot
-def _milliseconds(
-    config: WalkConfig, of_state: Layout, shapes: tuple[tuple[int, ...], ...], *layouts: Layout
-) -> Callable[..., Array]:
-    """Compile the milliseconds of a tick, from packed trees to the next state, packed, on a CPU.
-
-    The program takes constants, plan and state, all packed, the reading now and the errors of each
-    millisecond, whose shapes are given. After the torques of each millisecond it calls the host,
-    which steps the plant and reads it: a call of JAX for each would take as long as the step.
+def _torques(config: WalkConfig, *layouts: Layout) -> Callable[..., Array]:
+    """Compile the torques of a millisecond, from packed trees to the next state, packed.
 
     XLA runs a kernel for each of a hundred operations and distributes them to its threads, which
     takes several times as long as the operations: a call marked as small is compiled into one
     kernel. If that fails, because an operation exists only as a kernel of its own (products have
     one unless `setup_jax` has turned off YNNPACK), the call is compiled as usual.
     """
-    layouts = *layouts, of_state
 
-    def torques(packed: tuple[Array, ...], reading: Array, errors: Array, substep: Array) -> Array:
-        constants, (memory, plan), (_, yaw, motors) = map(unpack, layouts, packed)
-        robot, parameters, _, imperfections = constants
-        measurement, yaw = sensing.measure(robot, reading, yaw, errors[substep])
+    def torques(*packed: Array) -> Array:
+        constants, (memory, plan), (_, yaw, motors), now = map(unpack, layouts, packed)
+        (robot, parameters, _, imperfections), (substep, reading, error) = constants, now
+        measurement, yaw = sensing.measure(robot, reading, yaw, error)
         inputs: Any = {"memory": memory, "substep": substep, "measurement": measurement}
         torque = controller.actuate(config, robot, parameters.legs, plan=plan, **inputs)
         motors, torque = step_actuators(robot, imperfections, motors, torque)
         return pack((torque, yaw, motors))
 
-    def small_call(*now: Any) -> Array:
+    def small_call(*packed: Array) -> Array:
         with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
-            return jax.jit(torques)(*now)
+            return jax.jit(torques)(*packed)
 
-    @partial(jax.jit, static_argnums=0)
-    def milliseconds(torques: Callable[..., Array], *inputs: Array) -> Array:
-        *packed, state, reading, errors, host = inputs
-
-        def step(substep: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
-            state = torques((*packed, now[0]), now[1], errors, substep)
-            return state, host_call(host, state, len(reading))
-
-        return jax.lax.fori_loop(0, len(errors), step, (state, reading))[0]
-
-    with suppress(jax.errors.JaxRuntimeError), serving(lambda *_: None) as host:
-        sizes = (sum(leaf.size for leaf in leaves) for _, leaves in layouts)
-        milliseconds(small_call, *map(np.zeros, (*sizes, *shapes)), host)
-        return partial(milliseconds, small_call)
-    return partial(milliseconds, torques)
+    if jax.default_backend() == "cpu":
+        compiled = jax.jit(small_call)
+        with suppress(jax.errors.JaxRuntimeError):
+            compiled(*(np.zeros(sum(leaf.size for leaf in leaves)) for _, leaves in layouts))
+            return compiled
+    return jax.jit(torques)
 
 
 BLOCK = 10  # ticks that are sampled by one call, whose cost hardly grows with their number
@@ -258,14 +241,16 @@ class Stepper:
         self.config, self.robot, self.plant = config, robot, plant
         self.count, self.clock = substeps(config), first_tick(config)  # the next gait tick
         joints, self._start, yaw = len(robot.joint_lower), job.start_tick, np.zeros(())
-        # of each millisecond of a block
-        self._readings = np.zeros((BLOCK * self.count + 1, 13 + 3 * joints))
+        size = len(sensing.no_error(robot))
+        # inputs of each millisecond of a block: milliseconds since the plan, reading, error
+        self._rows = np.zeros((BLOCK * self.count + 1, 1 + 13 + 3 * joints + size))
+        self._rows[:, 0] = np.arange(len(self._rows)) % self.count
+        self._errors, self._readings = self._rows[:, -size:], self._rows[:, 1:-size]
         plant.read(self._readings[0])
         self._body, self.anchor = jax.device_put(robot), standing_anchor(robot, job.start_tick)
         memory = _begin(self._body, self._readings[0])
         state = np.zeros(joints), yaw, init_actuators(joints)
-        errors = np.zeros((self.count, len(sensing.no_error(robot))))
-        measured = self._readings[0], errors[0]
+        measured = self._readings[0], self._errors[0]
         clock = np.int32(0)
         self.set_job(job)
         of_inputs = layout((self.anchor, clock, memory, yaw, *measured))
@@ -274,10 +259,8 @@ class Stepper:
         self._memory_size = packed.size
         self._planner_for = cache(partial(_planner, config, self._of_constants, of_inputs))
         self._sampled = _sampler(config, self._of_constants, of_inputs)
-        self._milliseconds_of = partial(
-            _milliseconds, config, layout(state), (self._readings[0].shape, errors.shape)
-        )
-        self._milliseconds, self._host = None, jax.local_devices(backend="cpu")[0]
+        self._torques_of = partial(_torques, config, self._of_constants)
+        self._torques, self._layouts = None, (layout(state), layout((clock, *measured)))
         self._inputs: list[np.ndarray] = []
         self._plans: list[np.ndarray] = []
 
@@ -317,31 +300,32 @@ class Stepper:
             errors: of the estimate in each of the n milliseconds.
             forces: on the trunk in each of them [N].
         """
-        first = len(self._plans) * self.count
-        reading = self._readings[first]
+        step, plant, rows = len(self._plans) * self.count, self.plant, self._rows
+        now = slice(step, step + self.count)
+        self._errors[now] = errors
         if self.clock == self._start:
-            self.set_anchor(_anchor(self._body, reading, self._yaw, self._start))
+            self.set_anchor(_anchor(self._body, self._readings[step], self._yaw, self._start))
         planner = self._planner_for(controller.contacts_needed(self.config, self.clock))
         memory = np.asarray(self._packed)[: self._memory_size]
-        parts = self._packed_anchor, [self.clock], memory, [self._yaw], reading, errors[0]
+        parts = self._packed_anchor, [self.clock], memory, [self._yaw], rows[step, 1:]
         self._inputs.append(np.concatenate(parts))
-        self._packed = planner.plan(self._constants, self._inputs[-1])
-        self._plans.append(np.asarray(self._packed))
-        steps = zip(self._readings[first + 1 :], forces, strict=False)
-
-        def step(state: np.ndarray, result: np.ndarray) -> None:
-            reading, force = next(steps)
-            self.plant.step(state[: self._joints], force)
-            self.plant.read(reading)
-            result[:] = reading
-
-        with serving(step) as host, jax.default_device(self._host):
-            if self._milliseconds is None:
-                self._plan_layout = planner.layout
-                self._milliseconds = self._milliseconds_of(self._of_constants, planner.layout)
-            now = self._constants, self._plans[-1], self._state, reading, errors, host
-            self._state = np.asarray(self._milliseconds(*now))
-        self._yaw, self.clock = self._state[self._joints], self.clock + 1
+        self._packed = packed = planner.plan(self._constants, self._inputs[-1])
+        self._plans.append(np.asarray(packed))
+        if self._torques is None:
+            self._plan_layout = planner.layout
+            self._torques = self._torques_of(planner.layout, *self._layouts)
+        constants, torques, state, joints = (
+            self._constants,
+            self._torques,
+            self._state,
+            self._joints,
+        )
+        after = self._readings[step + 1 : step + self.count + 1]
+        for row, force, reading in zip(rows[now], forces, after, strict=True):
+            state = torques(constants, packed, state, row)
+            plant.step(np.asarray(state)[:joints], force)
+            plant.read(reading)
+        self._state, self._yaw, self.clock = state, np.asarray(state)[joints], self.clock + 1
 
     def samples(self) -> tuple[Plan, Sample]:
         """Return the plans and samples (numpy) since the last call, of at least one tick."""
