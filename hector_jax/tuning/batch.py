@@ -131,18 +131,24 @@ def _evaluate(
     single = all(len(leaf) == 1 for leaf in jax.tree.leaves(effects))
     weights = difftune.trial_weights(config, state)
 
-    def slope(of: BatchScenario) -> tuple[Evaluation, Array]:
-        effect = jax.tree.map(lambda leaf: leaf[0 if single else of.effect], effects)
-        scenario = Scenario(robot, of.command, of.anchor, effect, of.variation)
-        shared = config.rollout, scenario, weights, of.loss
+    def over_scenarios(function: Callable[[Scenario, Loss, Array], Any]) -> Any:
+        def of_scenario(of: BatchScenario) -> Any:
+            effect = jax.tree.map(lambda leaf: leaf[0 if single else of.effect], effects)
+            scenario = Scenario(robot, of.command, of.anchor, effect, of.variation)
+            return function(scenario, of.loss, of.scale)
+
+        return _map(lanes, of_scenario, problem.scenarios)
+
+    def slope(scenario: Scenario, loss: Loss, scale: Array) -> tuple[Evaluation, Array]:
+        shared = config.rollout, scenario, weights, loss
         if config.rule == "gauss_newton":
             found, matrix = least_squares(*shared, walk=walk, others=config.others)
         else:
             found, matrix = evaluate(*shared, walk=walk), jnp.zeros_like(state.rule.matrix)
-        loss, terms, gradient, matrix = jax.tree.map(lambda x: x / of.scale, (*found[:3], matrix))
+        loss, terms, gradient, matrix = jax.tree.map(lambda x: x / scale, (*found[:3], matrix))
         return found._replace(loss=loss, terms=terms, gradient=gradient), matrix
 
-    stacked, matrices = _map(lanes, slope, problem.scenarios)
+    stacked, matrices = over_scenarios(slope)
     weighted_sum = partial(jnp.tensordot, tail_weights(stacked.loss, problem.tail), axes=1)
     value, terms, gradient, matrix = jax.tree.map(weighted_sum, (*stacked[:3], matrices))
     fallen, residual = jnp.max(stacked.fallen), jnp.max(stacked.residual)
