@@ -83,7 +83,7 @@ def least_squares(
     zero = jnp.zeros(len(steps_between(weights, weights, others)))
 
     def rows(steps: Float[Array, " n"]) -> tuple[Float[Array, " rows"], tuple[Array, Trajectory]]:
-        trajectory = walk(config, scenario, stepped(weights, steps, others), forward=True)
+        trajectory = walk(config, scenario, stepped(weights, steps, others))
         r = residuals(loss, trajectory)
         return r, (r, trajectory)
 

@@ -16,9 +16,8 @@ from hector_jax.core.tree import stack
 from hector_jax.tuning.loss import Loss, Terms, losses, total, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
-Walk = Callable[..., Trajectory]
-"""`rollout`, or another walk on the model by its settings, what it walks, and weights, with
-`forward` for derivatives in forward mode."""
+Walk = Callable[[RolloutConfig, Any, Weights], Trajectory]
+"""`rollout`, or another walk on the model by its settings, what it walks, and weights."""
 
 
 class Evaluation(NamedTuple):

@@ -160,16 +160,13 @@ def _turned(x: MeasuredState, yaw: Float[Array, ""]) -> MeasuredState:
     return MeasuredState(State(state.euler, position, rates, velocity), feet)
 
 
-def grounded_rollout(
-    config: RolloutConfig, grounding: Grounding, weights: Weights, *, forward: bool = False
-) -> Trajectory:
+def grounded_rollout(config: RolloutConfig, grounding: Grounding, weights: Weights) -> Trajectory:
     """Walk on the model from the end of a walk's first tick, adding its residuals.
 
     Args:
         config: that of the grounding.
         grounding: see `fit_grounding`.
         weights: theta; the gradient is taken with respect to these.
-        forward: see `rollout`.
 
     Returns:
         Trajectory of T - 1 samples. Nothing raises: check `fallen` and `residual`.
@@ -183,7 +180,7 @@ def grounded_rollout(
         error, residual, tick, row = inputs
         options = {"error": error, "planner": _planner(row, carry, walked, weights)}
         twin = without_numbers(weights)
-        after, sample = step_carry(config, scenario, twin, carry, tick, **options, forward=forward)
+        after, sample = step_carry(config, scenario, twin, carry, tick, **options)
         residual = _turned(residual, carry.state.euler[2])
         state, feet = jax.tree.map(jnp.add, MeasuredState(after.state, after.feet), residual)
         fallen = carry.fallen | has_fallen(state, *scenario.robot.description.limits)

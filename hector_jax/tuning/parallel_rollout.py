@@ -149,10 +149,8 @@ def _newton(
     return steps, converged
 
 
-def parallel_rollout(
-    config: RolloutConfig, scenario: Scenario, weights: Weights, *, forward: bool = False
-) -> Trajectory:
-    """Walk on the single rigid body, all ticks at once; `forward` makes no difference.
+def parallel_rollout(config: RolloutConfig, scenario: Scenario, weights: Weights) -> Trajectory:
+    """Walk on the single rigid body, all ticks at once.
 
     Takes what `rollout` takes and returns the same up to a fall, but for rounding. It can be
     differentiated once and by `weights` only; other derivatives are zero. A rollout that has not

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Int
 
 from hector_jax import qp
@@ -27,7 +26,6 @@ from hector_jax.control.controller import (
 )
 from hector_jax.control.disturbance import NO_DISTURBANCE
 from hector_jax.control.footstep import Feet, feet_where
-from hector_jax.control.mpc import feet_of_contacts
 from hector_jax.control.reference import Anchor, Command, anchor_at, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
@@ -223,50 +221,6 @@ def _own_planner(
     )
 
 
-def _planner_by_rows(
-    config: RolloutConfig,
-    scenario: Scenario,
-    weights: Weights,
-    carry: Carry,
-    tick: Int[Array, ""],
-) -> Callable[..., Plan]:
-    """Return `_own_planner` with another way to the same derivative, for many tangents at once.
-
-    The wrenches of the feet that stand have fewer numbers than there are tangents. So the MPC is
-    differentiated in reverse, once for each of them, and tangents are multiplied by these rows.
-    """
-    contact = gait.contact(config.walk.gait, tick).astype(carry.state.euler.dtype)
-    selection = feet_of_contacts(contact, contacts_needed(config.walk, 0))
-
-    def planner(state: State, feet: Feet) -> Plan:
-        last = jax.tree.map(lambda w: w[:1], carry.commands)
-        used = varied(carry)._replace(state=state, feet=feet, commands=last, before=None)
-        inputs, to_parts = ravel_pytree((weights, used))
-
-        def planned(inputs: jax.Array) -> Plan:
-            weights, parts = to_parts(inputs)
-            at = with_constants(parts, carry)
-            own = _own_planner(config, scenario, weights, at, tick)
-            return own(state=at.state, feet=at.feet)
-
-        def rows(inputs: jax.Array) -> tuple[jax.Array, Plan]:
-            found = planned(inputs)
-            return jnp.ravel(selection @ jnp.concatenate(found.wrench, axis=1)), found
-
-        at = jax.lax.stop_gradient(inputs)
-        wrench, pull_back, found = jax.vjp(rows, at, has_aux=True)
-        (by_inputs,) = jax.vmap(pull_back)(jnp.eye(len(wrench), dtype=wrench.dtype))
-        moved = selection.T @ (wrench + by_inputs @ (inputs - at)).reshape(-1, 6)
-        rest = planned(inputs)  # without its wrench, so that no QP is solved for it
-        return found._replace(
-            wrench=Wrench(moved[:, :3], moved[:, 3:]),
-            touchdown=rest.touchdown,
-            disturbance=rest.disturbance,
-        )
-
-    return planner
-
-
 def step_carry(
     config: RolloutConfig,
     scenario: Scenario,
@@ -277,14 +231,13 @@ def step_carry(
     wrench: Wrench | None = None,
     error: tuple[State, Feet] | None = None,
     planner: Callable[..., Plan] | None = None,
-    forward: bool = False,
 ) -> tuple[Carry, Trajectory]:
     """Walk one tick of the closed loop: plan, effect, motion.
 
     Returns the next carry and the tick's sample of the trajectory. A `wrench` takes the place of
     the planned one, and `error` is that of the estimated state and feet in place of a variation's.
     A `planner` of `state` and `feet` plans in place of this controller. The anchor is that of the
-    carry. `forward` is for derivatives by many numbers in forward mode.
+    carry.
     """
     robot, command, _, effect, variation = scenario
     walk, dt = config.walk, config.walk.gait.tick
@@ -293,8 +246,9 @@ def step_carry(
     state, feet, drift = _estimate(carry, tick, variation)
     if error is not None:
         state, feet = jax.tree.map(jnp.add, (carry.state, carry.feet), tuple(error))
-    own = _planner_by_rows if forward else _own_planner
-    planner = planner or own(config, scenario, weights, carry._replace(anchor=anchor), tick)
+    planner = planner or _own_planner(
+        config, scenario, weights, carry._replace(anchor=anchor), tick
+    )
     planned = planner(state=state, feet=feet)
     planned = planned if wrench is None else planned._replace(wrench=wrench)
     commands = jax.tree.map(
@@ -340,16 +294,13 @@ def with_variation(config: RolloutConfig, scenario: Scenario) -> Scenario:
     return scenario._replace(variation=noise_and_delay(config.estimate_noise, config.delay))
 
 
-def rollout(
-    config: RolloutConfig, scenario: Scenario, weights: Weights, *, forward: bool = False
-) -> Trajectory:
+def rollout(config: RolloutConfig, scenario: Scenario, weights: Weights) -> Trajectory:
     """Walk on the single rigid body: `lead` ticks in place from standing, then the command.
 
     Args:
         config: static settings.
         scenario: robot, command, start, phi and variation.
         weights: theta; the gradient is taken with respect to these.
-        forward: make derivatives by many numbers in forward mode quick, and those in reverse slow.
 
     Returns:
         Trajectory of T samples from t = 0. Nothing raises: check `fallen` and `residual` before
@@ -365,7 +316,7 @@ def rollout(
     # sample is known only while a tick is traced: the scan returns it as a tree without arrays.
     def tick(packed: jax.Array, number: Int[Array, ""]) -> tuple:
         carry = unpack(layout(first), packed)
-        after, sample = step_carry(config, scenario, weights, carry, number, forward=forward)
+        after, sample = step_carry(config, scenario, weights, carry, number)
         assert layout(after) == layout(first)
         return pack(after), (pack(sample), jax.tree_util.Partial(partial(unpack, layout(sample))))
 
