@@ -169,7 +169,7 @@ def draw_gallery(path: Path, robots: Sequence[Path]) -> None:
     named = {file.parent.name: load_robot(file) for file in robots}
     tiles = [_still(robot, nominal(robot), f"{name}: nominal") for name, robot in named.items()]
     width, height = tiles[0].size
-    _paste(path, [tile.resize((2 * width // 3, 2 * height // 3)) for tile in tiles], 8)
+    _paste(path, [tile.resize((width // 2, height // 2)) for tile in tiles], 8)
 
 
 def _paste(path: Path, tiles: Sequence[Image.Image], columns: int) -> None:
