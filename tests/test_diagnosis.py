@@ -152,7 +152,7 @@ def test_a_start_that_falls_late_is_told_and_tuned_from(monkeypatch, tmp_path, c
     run = tune._Run(setup, tmp_path, Tune(), nominal(), trajectories)
     tune._check_start(run)
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("--start nominal is tuned from although s on the high-fidelity")
+    assert line.startswith("--start nominal falls late and is tuned from nevertheless: s on the")
     assert "fell after 3.70 s" in line
     uprights |= {"straight": 1.9, "s": 0.4}
     with pytest.raises(InputError, match="nominal cannot be tuned from: straight on the high"):

@@ -177,6 +177,10 @@ OF_STRIDER = {  # a change of the strider's TOML
     "robot.toml: unknown field 'gate'.*did you mean 'gait'?": ("[gait]", "[gate]"),
     "gait: stance must be a whole number.*got '22'": ("stance = 22", 'stance = "22"'),
     r"legs.kp must be a number for each of the 5 joints.*got \(150.0,": ("kp = [150,", "kp = ["),
+    r"legs.armature must be a number for each of the 5 joints.*got \(0.01,": (
+        "[legs]",
+        "[legs]\narmature = [0.01, 0.01]",
+    ),
     "robot.toml: gait.tick must be at most half": ("[mpc]", "[mpc]\nstep_ticks = 1"),
     "did you mean 'friction'": ("[mpc]", "[mpc]\nconstraints = ['frictoin']"),
     "joints: left and right must be 3 to 7 names each.*got 4 and 5": ('"left_yaw", ', ""),

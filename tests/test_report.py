@@ -192,6 +192,9 @@ def test_the_report_opens_with_errors_falls_and_the_next_step_and_says_below_whe
     found = {"with": of._replace(rms_position=far, fallen=fallen)}
     _, _, worse, after = report.first_lines(verdict._replace(scores=verdict.scores | found), "x")
     assert worse.startswith("Worse on s: 6.7 cm off in the plane, nominal 2.2; 2 falls, nominal 0.")
+    assert worse.endswith(" Tune for it alone, or keep nominal there.")
+    alone = verdict._replace(scores=verdict.scores | found).of_scene("s")
+    assert report.first_lines(alone, "x")[2].endswith("nominal 0. Keep nominal there.")
     assert after.startswith("Next")
     verdict = pretend_verdict()
     swapped = {"nominal": verdict.scores["with"], "with": verdict.scores["nominal"]}

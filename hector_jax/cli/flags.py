@@ -263,7 +263,7 @@ class Evaluate(Configured, ForRobot, ByWalker, Parallel, Printed):
     """
 
     usual = frozenset("weights runs traj world engine plant seeds until_clear robot out".split())
-    # nominal, expert, shipped, weights files, runs, folders of straight.json, c.json, ..; NAME=one
+    # nominal, expert, shipped, files, runs, folders of straight.json, c.json, ...; or NAME=one
     weights: tuple[WeightSets, ...] = OF_ROBOT
     runs: tuple[Run, ...] = ()  # instead: finished runs of `hector tune`, side by side
     traj: Trajectories = ("straight",)  # names (all: straight, c and s) or TOML files

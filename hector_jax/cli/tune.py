@@ -246,7 +246,7 @@ def _check_start(run: _Run) -> None:
     if longest < run.seconds / 2:
         raise InputError(f"--start {text} cannot be tuned from: {falls[0]}")
     for fall in falls:
-        say(f"--start {text} is tuned from although {fall}")
+        say(f"--start {text} falls late and is tuned from nevertheless: {fall}")
 
 
 def _note_settings(run: _Run, net: nets.TrainedNet) -> dict[str, Any]:

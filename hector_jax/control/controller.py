@@ -117,12 +117,11 @@ def walk_config(robot: Robot) -> WalkConfig:
             f"numbers), got {short_repr(config.gait.pattern)}"
         )
     joints = robot.description.leg_joints
-    of_joints = {name: getattr(config.legs, name) for name in ("kp", "kd", "armature")}
-    for name, gains in of_joints.items():
-        if len(gains) != joints and (gains or name != "armature"):
+    for name in ("kp", "kd", *(("armature",) if config.legs.armature else ())):
+        if len(numbers := getattr(config.legs, name)) != joints:
             raise InputError(
                 f"{path}: legs.{name} must be a number for each of the {joints} joints of a leg, "
-                f"got {short_repr(gains)}"
+                f"got {short_repr(numbers)}"
             )
     return config
 

@@ -72,7 +72,8 @@ def pin_options() -> None:
     threadpool_limits(1, user_api="blas")
     # From jaxlib 0.10.0 to 0.11.0 a batch of factorisations waits for parts of it that threads of
     # XLA's pool compute: batches that begin together can wait in all of them, for ever. With one
-    # thread a batch is computed where it begins, and our programs are no slower.
+    # thread a batch is computed where it begins, and our programs are no slower. A value of the
+    # user's own gives way: it would hang, and change the rounding.
     os.environ["PJRT_NPROC"] = "1"
     add_flags()
     values = (_defaults() if not_used() else {}) | PINNED

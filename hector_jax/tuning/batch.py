@@ -256,10 +256,7 @@ def tune_batch(
     problems_each = math.ceil(count / len(devices))
     rollouts = problems_each * np.shape(problems.scenarios.scale)[1]
     walk = walk or choose_rollout(devices[0].platform, config.rollout, rollouts)
-    usual = lanes_of(devices[0].platform)
-    lanes = usual if lanes is None else lanes
-    if usual == 1 != lanes and len(jax.local_devices(backend="cpu")) > 1:
-        raise ValueError(f"lanes must be 1 where a CPU is several devices, got {lanes}")
+    lanes = _checked_lanes(lanes, devices[0].platform)
     mesh = Mesh(np.array(devices), (AXIS,))
     robot, effects, problems = jax.tree.map(np.asarray, (robot, effects, problems))
     config = replace(config, loss=PAPER_LOSS)  # unused, and so one program for all losses
@@ -283,6 +280,13 @@ def tune_batch(
         lambda *parts: np.concatenate(parts, axis=1)[:count, : config.iterations + 1], *histories
     )
     return jax.device_get(jax.vmap(partial(difftune.result, config))(final, history))
+
+
+def _checked_lanes(lanes: int | None, backend: str) -> int:
+    usual = lanes_of(backend)
+    if usual == 1 and lanes not in (None, 1) and len(jax.local_devices(backend="cpu")) > 1:
+        raise ValueError(f"lanes must be 1 where a CPU is several devices, got {lanes}")
+    return usual if lanes is None else lanes
 
 
 def _check_problems(
