@@ -238,8 +238,7 @@ def tune_batch(
         problems: stacked, see `stack`; the same on every host.
         effects: phis, stacked too; `BatchScenario.effect` is the index into them.
         devices: on which to compute; None takes all.
-        lanes: problems in parallel on a device, 0 for all; None takes `lanes_of` the backend, and
-            where a CPU is several devices there is no other number.
+        lanes: problems in parallel on a device, 0 for all; None takes `lanes_of` the backend.
         walk: `rollout` or `parallel_rollout`; None takes `choose_rollout`.
         report_progress: takes the number of problems that have ended, the number of all problems
             and a message; see `console.bar`.
