@@ -15,7 +15,14 @@ from oracles import exact_solution, pack_state
 from hector_jax.control import LINE_FOOT, InputConstraint, InputCost, Squares, StateConstraint
 from hector_jax.control.contact import FLAT_FOOT, FRICTION, LINE_FRICTION, Contact, Rows, StateCost
 from hector_jax.control.disturbance import NO_DISTURBANCE
-from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, build_qp, solve_mpc
+from hector_jax.control.mpc import (
+    Horizon,
+    MpcConfig,
+    MpcProblem,
+    build_qp,
+    solve_mpc,
+    solve_mpc_by_rows,
+)
 from hector_jax.control.parameters import bounds
 from hector_jax.control.weights import Weights, expert, vector_to_weights, weights_to_vector
 from hector_jax.core.geometry import rot_z
@@ -356,3 +363,28 @@ def test_the_derivative_without_the_matrix_is_that_of_the_qp(contacts, stance):
         np.testing.assert_allclose(one, other, atol=1e-8 * np.abs(other).max())
     both = sum(float(jnp.vdot(g, d)) for g, d in zip(reverse[0], along, strict=True))
     assert both == pytest.approx(float(pull @ forward[0][1]), rel=1e-8)
+
+
+@pytest.mark.parametrize(("contacts", "stance"), [(1, None), (2, BOTH)])
+def test_the_derivative_by_rows_is_that_of_the_wrench_for_many_tangents_and_in_reverse(
+    contacts, stance
+):
+    state, horizon = problem(6, push=2.0, contact=stance)
+    config = MpcConfig()
+
+    def wrench(solve, inputs):
+        logs, shift, turn = jnp.split(inputs, (24, 27))
+        weights = vector_to_weights(weights_to_vector(expert()) * jnp.exp(logs))
+        moved = state._replace(position=state.position + shift)
+        turned = horizon._replace(foot_yaw=horizon.foot_yaw + turn)
+        asked = MpcProblem(ROBOT, config.parameters(weights), moved, turned, LACKING)
+        return pack_wrench(solve(config, asked, DT, contacts)[0])
+
+    at, found = jnp.zeros(29), []
+    for solve in (solve_mpc, solve_mpc_by_rows):
+        of = partial(wrench, solve)
+        found.append(jax.jit(lambda of=of: (of(at), jax.jacfwd(of)(at), jax.jacrev(of)(at)))())
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    for one, other in zip(found[0][1:], found[1][1:], strict=True):
+        assert np.abs(one[:, 27:]).max() > 1e-3  # also by what the wrench alone depends on
+        np.testing.assert_allclose(one, other, atol=1e-10 * np.abs(one).max())

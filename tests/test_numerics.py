@@ -170,17 +170,24 @@ def test_batches_of_factorisations_in_two_threads_do_not_wait_for_each_other(sol
     assert done.returncode == 0, done.stderr
 
 
-YNN, EMITTERS = "--xla_cpu_experimental_ynn_fusion_type=", "--xla_cpu_use_fusion_emitters=false"
-BOTH = [("", "YNN EMITTERS"), ("--xla_a=1 word", "YNN EMITTERS --xla_a=1 word")]
-BOTH += [("YNNdot --xla_a=1", "EMITTERS YNNdot --xla_a=1"), ("flags.txt", "flags.txt")]
+FLAGS = {
+    "YNN": "--xla_cpu_experimental_ynn_fusion_type=",
+    "EMITTERS": "--xla_cpu_use_fusion_emitters=false",
+    "COMPILERS": "--xla_gpu_force_compilation_parallelism=16",
+}
+SET = [("", "YNN EMITTERS COMPILERS")]
+SET += [("--xla_a=1 word", "YNN EMITTERS COMPILERS --xla_a=1 word"), ("flags.txt", "flags.txt")]
+SET += [("YNNdot --xla_a=1", "EMITTERS COMPILERS YNNdot --xla_a=1")]
 
 
-@pytest.mark.parametrize(("before", "after"), BOTH)
+@pytest.mark.parametrize(("before", "after"), SET)
 @pytest.mark.parametrize("version", [(0, 10, 1), (0, 10, 2), (0, 12, 0, 1), (0, 13, 0)])
 def test_flags_are_set_where_they_are_known(monkeypatch, version, before, after):
     known = {"YNN": (0, 10, 2) <= version < (0, 13), "EMITTERS": version < (0, 11)}
+    known["COMPILERS"] = version < (0, 13)
     after = " ".join(word for word in after.split() if known.get(word, True))
-    before, after = (t.replace("YNN", YNN).replace("EMITTERS", EMITTERS) for t in (before, after))
+    for name, flag in FLAGS.items():
+        before, after = before.replace(name, flag), after.replace(name, flag)
     assert without_our_flags(after) == before  # in the keys, the user's alone
     monkeypatch.setattr("jaxlib.version.__version_info__", version)
     monkeypatch.setenv("XLA_FLAGS", before)

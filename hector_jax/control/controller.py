@@ -250,19 +250,20 @@ def plan(
     last: Wrench | None = None,
     desired: State | None = None,
     max_contacts: int = 1,
+    solver: Callable[..., tuple[Wrench, Solution]] = solve_mpc,
 ) -> Plan:
     """Solve the MPC for one tick.
 
     Args:
         config, robot, parameters: the controller.
         command, anchor: the commanded motion.
-        tick: current gait tick.
-        state: current base state.
+        tick, state: current gait tick and base state.
         feet: current foot points; those of feet in the air are used by a frozen twin only.
         disturbance: from the previous plan.
         last: wrench of the previous plan, which is kept between plans of several ticks; None: plan.
         desired: pose at the start of the reference of a log; None: by the rule of the twin.
         max_contacts: from `contacts_needed` (static).
+        solver: `solve_mpc` or `solve_mpc_by_rows`.
 
     Returns:
         The commanded wrench, the planned touchdowns, and the disturbance for the next plan.
@@ -288,11 +289,10 @@ def plan(
     disturbance = integrate_error(mpc.integral, disturbance, state, reference, loaded)
     mpc = mpc._replace(weights=config.twin.weights(mpc.weights))
     problem = MpcProblem(config.twin.body(robot), mpc, state, horizon, disturbance)
-    solve = partial(solve_mpc, config.mpc, problem, dt=config.mpc_step, max_contacts=max_contacts)
+    solve = partial(solver, config.mpc, problem, config.mpc_step, max_contacts)
     held = last is not None and every > 1
     wrench, solution = _solve_or_keep(solve, last, tick % every == 0) if held else solve()
-    residuals = solution.primal_residual, solution.dual_residual, solution.gap
-    residual = reduce(jnp.maximum, residuals)
+    residual = reduce(jnp.maximum, (solution.primal_residual, solution.dual_residual, solution.gap))
     if config.twin != TwinConfig():  # a foot in the air exerts nothing
         wrench = jax.tree.map(lambda x: contact[:, None] * x, wrench)
     return Plan(wrench, contact, touchdown, swing_ticks, residual, solution.status, disturbance)

@@ -48,7 +48,7 @@ _FREE = tuple(
         " jax_traceback jax_tracer_error jax_send_traceback jax_hlo_source"
     ).split()
 )
-# XLA's flags on the CPU with the versions of jaxlib, from the first to before the second, that know
+# XLA's flags with the versions of jaxlib, from the first to before the second, that know
 # them: an unknown flag ends a process
 _FLAGS = {
     # No YNNPACK: its sums read memory that nothing has written. With jaxlib 0.12 a third of the
@@ -56,6 +56,8 @@ _FLAGS = {
     "--xla_cpu_experimental_ynn_fusion_type=": ((0, 10, 2), (0, 13)),
     # No MLIR for fused kernels: programs are as quick and compile in half the time.
     "--xla_cpu_use_fusion_emitters=false": ((0, 10), (0, 11)),
+    # A GPU's programs compile in XLA's pool too, which has one thread: three times as long.
+    "--xla_gpu_force_compilation_parallelism=16": ((0, 10), (0, 13)),
 }
 
 

@@ -36,7 +36,7 @@ from hector_jax.tuning.evaluate import Evaluation, Walk, evaluate
 from hector_jax.tuning.loss import PAPER_LOSS, Loss
 from hector_jax.tuning.parallel_rollout import parallel_rollout
 from hector_jax.tuning.rollout import RolloutConfig, Scenario, rollout
-from hector_jax.tuning.status import StepStatus, Stop
+from hector_jax.tuning.status import Stop
 from hector_jax.tuning.variation import Variation
 
 AXIS = "problems"
@@ -126,39 +126,27 @@ def _evaluate(
     problem: BatchProblem,
     state: TuneState,
 ) -> tuple[Evaluation, Float[Array, "n n"]]:
-    """Evaluate all scenarios of a problem as one; also return the matrix, where it is needed."""
+    """Evaluate all scenarios of a problem as one; also return the matrix, zero without a need."""
     config, lanes, walk, _ = program
     single = all(len(leaf) == 1 for leaf in jax.tree.leaves(effects))
     weights = difftune.trial_weights(config, state)
 
-    def over_scenarios(function: Callable[[Scenario, Loss, Array], Any]) -> Any:
-        def of_scenario(of: BatchScenario) -> Any:
-            effect = jax.tree.map(lambda leaf: leaf[0 if single else of.effect], effects)
-            scenario = Scenario(robot, of.command, of.anchor, effect, of.variation)
-            return function(scenario, of.loss, of.scale)
+    def slope(of: BatchScenario) -> tuple[Evaluation, Array]:
+        effect = jax.tree.map(lambda leaf: leaf[0 if single else of.effect], effects)
+        scenario = Scenario(robot, of.command, of.anchor, effect, of.variation)
+        shared = config.rollout, scenario, weights, of.loss
+        if config.rule == "gauss_newton":
+            found, matrix = least_squares(*shared, walk=walk, others=config.others)
+        else:
+            found, matrix = evaluate(*shared, walk=walk), jnp.zeros_like(state.rule.matrix)
+        loss, terms, gradient, matrix = jax.tree.map(lambda x: x / of.scale, (*found[:3], matrix))
+        return found._replace(loss=loss, terms=terms, gradient=gradient), matrix
 
-        return _map(lanes, of_scenario, problem.scenarios)
-
-    def value(scenario: Scenario, loss: Loss, scale: Array) -> Evaluation:
-        found = evaluate(config.rollout, scenario, weights, loss, walk=walk)
-        value, terms, gradient = jax.tree.map(lambda x: x / scale, found[:3])
-        return found._replace(loss=value, terms=terms, gradient=gradient)
-
-    def curvature(scenario: Scenario, loss: Loss, scale: Array) -> Array:
-        rollout, others = config.rollout, config.others
-        return least_squares(rollout, scenario, weights, loss, walk=walk, others=others)[1] / scale
-
-    stacked = over_scenarios(value)
+    stacked, matrices = _map(lanes, slope, problem.scenarios)
     weighted_sum = partial(jnp.tensordot, tail_weights(stacked.loss, problem.tail), axes=1)
-    loss, terms, gradient = jax.tree.map(weighted_sum, stacked[:3])
+    value, terms, gradient, matrix = jax.tree.map(weighted_sum, (*stacked[:3], matrices))
     fallen, residual = jnp.max(stacked.fallen), jnp.max(stacked.residual)
-    evaluation = Evaluation(loss, terms, gradient, fallen, residual)
-    none = jnp.zeros_like(state.rule.matrix)
-    if config.rule != "gauss_newton":
-        return evaluation, none
-    accepted = difftune.trial_status(config, state, evaluation) == StepStatus.ACCEPTED
-    matrix = lambda: weighted_sum(over_scenarios(curvature))  # noqa: E731
-    return evaluation, jax.lax.cond(accepted, matrix, lambda: none)
+    return Evaluation(value, terms, gradient, fallen, residual), matrix
 
 
 @partial(jax.jit, static_argnums=0, compiler_options=COMPILER_OPTIONS)

@@ -6,6 +6,7 @@ of H: one with a small eigenvalue changes neither walk nor loss.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -81,6 +82,7 @@ def least_squares(
         The evaluation, and the matrix in the n coordinates of `parameters.stepped`.
     """
     zero = jnp.zeros(len(steps_between(weights, weights, others)))
+    config = replace(config, forward=True)
 
     def rows(steps: Float[Array, " n"]) -> tuple[Float[Array, " rows"], tuple[Array, Trajectory]]:
         trajectory = walk(config, scenario, stepped(weights, steps, others))

@@ -175,8 +175,8 @@ def model_slope(
 ) -> tuple[Evaluation, Float[Array, "n n"] | None]:
     """Return what a tuning on the model steps by, compiled; see `evaluate.Objective`.
 
-    By the default rule it is one program: all derivatives of a rollout in forward mode take twice
-    as long as its gradient in reverse mode, and no longer than the matrix alone.
+    By the default rule it is one program: all derivatives of a rollout in forward mode take one and
+    a half times as long as its gradient in reverse mode.
     """
     if config.rule != "gauss_newton":
         return tune_step(config, scenario, weights), None

@@ -15,6 +15,8 @@ Source: Lim et al., Parallelizing non-linear sequential models over the sequence
 """
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -22,14 +24,11 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float, Int
 
-from hector_jax.control import gait
-from hector_jax.control.controller import contacts_needed
 from hector_jax.control.footstep import Feet
-from hector_jax.control.mpc import feet_of_contacts
 from hector_jax.control.reference import Anchor, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
-from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
+from hector_jax.core.trajectory import State, Trajectory, has_fallen
 from hector_jax.core.tree import pack
 from hector_jax.tuning.rollout import (
     Carry,
@@ -57,37 +56,20 @@ class _Step(NamedTuple):
 def _linearised(
     config: RolloutConfig, scenario: Scenario, weights: Weights, start: Carry
 ) -> Callable[[jax.Array, Array], _Step]:
-    """Return a function that steps and linearises a tick from the carry before it and its number.
-
-    The QP is differentiated in reverse, because the wrenches of the feet that stand have fewer
-    numbers than the inputs, the rest of the tick forwards.
-    """
+    """Return a function that linearises a tick from the carry before it and its number."""
     packed, to_parts = ravel_pytree(varied(start))
     theta, to_weights = ravel_pytree(weights)
+    config = replace(config, forward=True)
 
-    def step(inputs: jax.Array, tick: Array, wrench: Wrench | None = None) -> tuple:
+    def step(tick: Array, inputs: jax.Array) -> tuple[jax.Array, Trajectory]:
         before, weights = jnp.split(inputs, (len(packed),))
         carry = with_constants(to_parts(before), start)
-        return step_carry(config, scenario, to_weights(weights), carry, tick, wrench=wrench)
+        after, sample = step_carry(config, scenario, to_weights(weights), carry, tick)
+        return jnp.asarray(pack((varied(after), sample.effect))), sample
 
     def linearise(before: jax.Array, tick: Array) -> _Step:
         inputs = jnp.concatenate([before, theta])
-        contact = gait.contact(config.walk.gait, tick).astype(packed.dtype)
-        selection = feet_of_contacts(contact, contacts_needed(config.walk, 0))
-
-        def plan(inputs: jax.Array) -> tuple[jax.Array, Trajectory]:
-            _, sample = step(inputs, tick)
-            return jnp.ravel(selection @ jnp.concatenate(sample.command, axis=1)), sample
-
-        wrench, pull_back, sample = jax.vjp(plan, inputs, has_aux=True)
-        (by_inputs,) = jax.vmap(pull_back)(jnp.eye(len(wrench), dtype=wrench.dtype))
-
-        def move(changed: jax.Array) -> jax.Array:
-            planned = selection.T @ (wrench + by_inputs @ (changed - inputs)).reshape(-1, 6)
-            after, sample = step(changed, tick, Wrench(planned[:, :3], planned[:, 3:]))
-            return jnp.asarray(pack((varied(after), sample.effect)))
-
-        outputs, push_forward = jax.linearize(move, inputs)
+        outputs, push_forward, sample = jax.linearize(partial(step, tick), inputs, has_aux=True)
         jacobian = jax.vmap(push_forward, out_axes=1)(jnp.eye(len(inputs), dtype=inputs.dtype))
         return _Step(inputs, outputs, jacobian, sample)
 

@@ -26,6 +26,7 @@ from hector_jax.control.controller import (
 )
 from hector_jax.control.disturbance import NO_DISTURBANCE
 from hector_jax.control.footstep import Feet, feet_where
+from hector_jax.control.mpc import solve_mpc, solve_mpc_by_rows
 from hector_jax.control.reference import Anchor, Command, anchor_at, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
@@ -56,6 +57,7 @@ class RolloutConfig:
     block: int = 500  # most ticks with stored solves; longer rollouts are computed twice
     estimate_noise: float = 0.0  # factor on the noise of a real robot's estimate
     delay: float = 0.0  # [s] of the ground's reaction, at most a tick
+    forward: bool = False  # many derivatives in forward mode are quick, those in reverse slow
 
     def __post_init__(self) -> None:
         not_negative = dict.fromkeys(("lead", "estimate_noise"), NOT_NEGATIVE)
@@ -218,6 +220,7 @@ def _own_planner(
         disturbance=carry.disturbance,
         last=jax.tree.map(lambda w: w[0], carry.commands),
         max_contacts=contacts_needed(walk, 0),
+        solver=solve_mpc_by_rows if config.forward else solve_mpc,
     )
 
 
@@ -228,16 +231,14 @@ def step_carry(
     carry: Carry,
     tick: Int[Array, ""],
     *,
-    wrench: Wrench | None = None,
     error: tuple[State, Feet] | None = None,
     planner: Callable[..., Plan] | None = None,
 ) -> tuple[Carry, Trajectory]:
     """Walk one tick of the closed loop: plan, effect, motion.
 
-    Returns the next carry and the tick's sample of the trajectory. A `wrench` takes the place of
-    the planned one, and `error` is that of the estimated state and feet in place of a variation's.
-    A `planner` of `state` and `feet` plans in place of this controller. The anchor is that of the
-    carry.
+    Returns the next carry and the tick's sample of the trajectory. The `error` is that of the
+    estimated state and feet in place of a variation's. A `planner` of `state` and `feet` plans in
+    place of this controller. The anchor is that of the carry.
     """
     robot, command, _, effect, variation = scenario
     walk, dt = config.walk, config.walk.gait.tick
@@ -250,7 +251,6 @@ def step_carry(
         config, scenario, weights, carry._replace(anchor=anchor), tick
     )
     planned = planner(state=state, feet=feet)
-    planned = planned if wrench is None else planned._replace(wrench=wrench)
     commands = jax.tree.map(
         lambda new, old: jnp.concatenate([new[None], old[:-1]]), planned.wrench, carry.commands
     )
