@@ -6,6 +6,7 @@ Nothing is compiled: loaders and checks alone.
 import dataclasses
 import json
 from functools import partial
+from pathlib import Path
 from typing import get_args, get_origin
 
 import jax
@@ -23,6 +24,7 @@ from hector_jax.control import FootstepConfig, GaitConfig, LegConfig, MpcConfig,
 from hector_jax.control.trajectories import load_command
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.inputs import InputError, short_repr
+from hector_jax.core.journal import check_settings
 from hector_jax.core.tree_file import save_tree
 from hector_jax.grfm import network
 from hector_jax.grfm.training import TrainConfig
@@ -94,6 +96,16 @@ def test_settings_are_refused_by_field_and_value():
         assert "must " in message
         parts = (value, *value) if isinstance(value, tuple) else (value,)
         assert any(short_repr(one) in message or repr(one)[:20] in message for one in parts)
+
+
+def test_settings_that_differ_late_are_told_by_what_differs():
+    before = MpcConfig()
+    now = dataclasses.replace(before, max_force=before.max_force + 1)
+    with pytest.raises(InputError) as caught:
+        check_settings(Path("x"), {"mpc": str(before)}, {"mpc": str(now)})
+    for one in (before, now):
+        assert f"max_force={one.max_force}" in str(caught.value)
+    assert len(str(caught.value)) < 250
 
 
 def edited(part, entry, value):

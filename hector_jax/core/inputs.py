@@ -131,10 +131,31 @@ def listed(names: Sequence[str]) -> str:
 
 def short_repr(value: Any) -> str:
     """Return the `repr` of a value on one line of at most 60 characters."""
+    return _shortened(_repr_line(value))
+
+
+def short_reprs(one: Any, other: Any) -> tuple[str, str]:
+    """Return the `short_repr` of two values, from shortly before their first difference on.
+
+    >>> short_reprs([0.25] * 20 + [1], [0.25] * 20 + [2])
+    ('...0.25, 1]', '...0.25, 2]')
+    """
+    texts = _repr_line(one), _repr_line(other)
+    same = len(os.path.commonprefix(texts))
+    if same <= 40:
+        return _shortened(texts[0]), _shortened(texts[1])
+    begin = max(texts[0].rfind(" ", 0, same - 4), same - 30) + 1
+    return _shortened("..." + texts[0][begin:]), _shortened("..." + texts[1][begin:])
+
+
+def _repr_line(value: Any) -> str:
     try:
-        text = " ".join(repr(value).split())
+        return " ".join(repr(value).split())
     except ValueError:  # Python prints no integer of many thousand digits
-        text = "a number of too many digits"
+        return "a number of too many digits"
+
+
+def _shortened(text: str) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 

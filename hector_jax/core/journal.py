@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hector_jax.core.files import as_json, cannot_write, write_file
-from hector_jax.core.inputs import InputError, read_text, short_repr
+from hector_jax.core.inputs import InputError, read_text, short_reprs
 
 _OTHER_ROBOT = "for another robot of this name (`name` in its TOML), or before its files changed"
 _OTHER_CODE = "by other code or other versions of jax, jaxlib, mujoco or another package"
@@ -34,7 +34,8 @@ def check_settings(
         before, now = made.get(name), expected.get(name)
         if before == now:
             continue
-        what = f"with {name} {short_repr(before)}, this command expects {short_repr(now)}"
+        was, asked = short_reprs(before, now)
+        what = f"with {name} {was}, this command expects {asked}"
         what = {"robot": _OTHER_ROBOT, "code": _OTHER_CODE}.get(name, what)
         raise InputError(f"{path}: made {what}; {remedy}")
 
