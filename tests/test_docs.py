@@ -404,6 +404,8 @@ def disturbances():
     result = report("robustness/robustness.json")
     assert result["weights"]["shipped"] == tree_hash(shipped())
     assert result["totals"]["shipped"]["falls_more"] == []
+    of_worlds = [words.split("=")[1].split("-") for words in result["flags"]["plants"]]
+    assert [int(last) - int(first) + 1 for first, last in of_worlds] == [8, 8]
     scenes = {f"{c['traj']} {c['world']} {c['level']}": c["sets"] for c in result["cells"]}
     yield RESULTS, f"Of {len(result['cells'])} kinds of scenes"
 
@@ -498,6 +500,17 @@ def robots():
     more = [robot for robot, (before, after) in fell.items() if sum(after) > sum(before)]
     assert (more, len(fell) - len(more)) == (["anymal_c", "humanoid", "t1"], 3)
     yield RESULTS, "three robots fall less often and three more often"
+    before, after = np.array([[sum(x) > 0 for x in both] for both in fell.values()]).sum(axis=0)
+    assert (after, before) == (6, 5)
+    yield LIMITS, "six robots fall with `best`, and five with `nominal`"
+    rose = {
+        robot: sum(
+            round(plants * (1 - one[t]["best"]["change"]["nominal"]["wins"])) for t in COMMANDS
+        )
+        for robot, one in report("robots/robots.json")["robots"].items()
+    }
+    text = "L rose in {openloong} of {walks} walks of OpenLoong and in {adam_lite} of Adam Lite"
+    yield LIMITS, text.format(**rose, walks=3 * plants)
 
 
 def engines():
