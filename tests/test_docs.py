@@ -26,9 +26,10 @@ from pretend import pretend_verdict, python
 
 from hector_jax import load_robot, nominal, walk_config
 from hector_jax.cli import flags, parse
-from hector_jax.control.parameters import TUNABLES
+from hector_jax.control.parameters import TUNABLES, Q, R, check_in_box
 from hector_jax.control.reference import COMMANDS, named_command
-from hector_jax.control.weights_file import shipped
+from hector_jax.control.weights_file import load_weights, shipped
+from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.sim.margin import delay_lines
 from hector_jax.store.nets import CollectConfig
@@ -276,6 +277,25 @@ def test_what_pages_show_of_files_and_code_is_what_is_there(tmp_path):
     assert parse.from_file(flags.Tune, tmp_path / "night.toml").seeds == 32
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+
+
+def test_the_file_of_another_mpc_that_a_page_shows_is_read_and_tuned_from(tmp_path):
+    shown, part = blocks((DOCS / "howto" / "numbers.md").read_text())
+    robot, file = load_robot(ROOT / "examples" / "quadruped" / "robot.toml"), tmp_path / "mine.cpp"
+    file.write_text(shown)
+    weights = load_weights(file, robot)
+    assert weights.Q.ang_velocity.tolist() == [0.01, 0.01, 0.3]
+    assert {*weights.R.force.ravel()} == {4e-5}
+    check_in_box(weights)  # whose bounds the page has
+    assert (Q.lower, Q.upper, R.lower, R.upper) == (0.01, 1e4, 1e-7, 1.0)
+    for text, refused in {
+        shown.replace("0.01, 0.01", "0, 0"): "Q.ang_velocity must be a number from",
+        shown.replace("[all][all]", "[all]"): "takes 3 numbers, found 1",
+        part: "missing weight",
+    }.items():
+        file.write_text(text)
+        with pytest.raises(InputError, match=refused):
+            load_weights(file, robot)
 
 
 def words(text):  # a bar of a table is no word
