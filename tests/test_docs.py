@@ -621,7 +621,7 @@ def other_pages():
     walks_page = DOCS / "howto" / "walks.md"
     pairs = [pair for pair in report("foretell/standin.json")["pairs"] if pair["far"]]
     text = f"On {len({x['seed'] for x in pairs})} plants {held_of(pairs, foretell.HERE)} of "
-    text += f"{len(pairs)} intervals held what came; {0.9 * len(pairs):.0f} should"
+    text += f"{len(pairs)} intervals held the walked L; {0.9 * len(pairs):.0f} should"
     yield walks_page, text
     cases = report("foretell/cases.json")
     shifted = [pair for pair in cases["pairs"] if pair["world"] == "shifted"]
