@@ -225,7 +225,7 @@ class Tune(Configured, ByWalker, ByPlanner, Parallel):
     slopes: Literal["plans", "walks"] = "plans"
     walk_engine: WalkEngine = "c"  # of these walks; c: MuJoCo; extras: drake, pinocchio
     json: bool = False  # print JSON instead of the table; `run` is the folder
-    robot: RobotFile = None  # TOML file of another robot, in DATA/NAME and runs/NAME; or HECTOR
+    robot: RobotFile = None  # another robot's TOML: data in DATA/NAME, runs in runs/NAME; or HECTOR
 
 
 @_command
