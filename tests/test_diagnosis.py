@@ -120,7 +120,7 @@ def test_a_height_that_is_off_and_motors_at_their_limits_are_told(monkeypatch):
 def weak(tmp_path, monkeypatch):
     """A file of weights that are too shy of forces to stand."""
     monkeypatch.chdir(tmp_path)
-    shy = nominal()._replace(R=jax.tree.map(lambda x: 1e6 * x, nominal().R))
+    shy = nominal()._replace(R=jax.tree.map(np.ones_like, nominal().R))  # the most of a tuning
     save_weights(tmp_path / "weak.json", shy)
     return tmp_path
 
@@ -132,6 +132,18 @@ def test_a_start_that_falls_is_refused_before_anything_is_collected(monkeypatch,
     line = "--start weak.json cannot be tuned from: straight on the high-fidelity simulator fell at"
     assert line in capsys.readouterr().err
     assert not list(weak.glob("data/**/*.npz"))
+
+
+def test_a_start_out_of_the_box_of_a_tuning_is_refused_before_it_walks(monkeypatch, weak, capsys):
+    high = nominal()
+    high.Q.position[1] = 1e5
+    save_weights(weak / "high.json", high)
+    for command in (("tune", "--traj", "straight"), ("propose", "folder", "--traj", "straight")):
+        assert call(monkeypatch, *command, "--start", "high.json") == 2
+        told = capsys.readouterr().err
+        line = "--start high.json: Q_y is 100000; a tuning starts from weights of 0.01 to 10000"
+        assert line in told
+        assert "walking" not in told
 
 
 def test_a_start_that_falls_late_is_told_and_tuned_from(monkeypatch, tmp_path, capsys):

@@ -26,7 +26,7 @@ from hector_jax.cli.flags import (
 from hector_jax.control import trajectories
 from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import gait_named
-from hector_jax.control.parameters import Tunable, numbers_of
+from hector_jax.control.parameters import Tunable, check_in_box, numbers_of
 from hector_jax.control.reference import COMMANDS
 from hector_jax.control.trajectories import NamedCommand, beyond, limits
 from hector_jax.control.weights import Weights, expert, nominal
@@ -46,6 +46,7 @@ from hector_jax.sim.engine import MUJOCO_C, Engine, choose_engine
 from hector_jax.sim.loop import Job, check_plant
 from hector_jax.sim.standin import FAMILIES
 from hector_jax.sim.world import Imperfections, named_world
+from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.verdict import judging
 from hector_jax.verdict.metrics import family_of
@@ -61,6 +62,20 @@ def weights_by_name(text: str, robot: Robot) -> Weights:
     if text in named:
         return with_numbers(named[text](robot), robot)
     return load_weights(Path(text), robot)
+
+
+def weights_to_tune(text: str, robot: Robot, config: TuneConfig) -> Weights:
+    """Return the weight set of this name, or of a file, from which a tuning is to start.
+
+    Raises:
+        InputError: the file holds none, or a number is out of the box of the tuning.
+    """
+    weights = weights_by_name(text, robot)
+    try:
+        check_in_box(difftune.init(config, weights).start, config.others)
+    except InputError as error:
+        raise InputError(f"--start {text}: {error}") from None
+    return weights
 
 
 def engine_of(args: Evaluate | Tune | Walk) -> Engine:

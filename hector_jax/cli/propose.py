@@ -212,7 +212,7 @@ def _campaign(args: Propose) -> Campaign:
     config = arguments.with_length(config, trajectories[0].seconds)
     begun = (args.folder / CONFIG).exists()  # from weights that --start may no longer name
     start = str(walks.weights_path(args.folder, 0)) if begun else args.start
-    start = arguments.weights_by_name(start, robot)
+    start = arguments.weights_to_tune(start, robot, config)
     commands = {trajectory.name: trajectory.command for trajectory in trajectories}
     planner = arguments.planner_of(args)
     if planner and config.others:
