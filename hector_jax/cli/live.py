@@ -15,7 +15,7 @@ from hector_jax.control.weights import Weights
 from hector_jax.core.console import Broken, say
 from hector_jax.core.inputs import InputError, require_package
 from hector_jax.core.pool import start_process, workers
-from hector_jax.robot.model import Robot, compile_model, load_robot
+from hector_jax.robot.model import Robot, load_robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import WORLDS, named_world
 from hector_jax.view.live import simulate
@@ -55,10 +55,8 @@ def run_live(args: View) -> None:
         words += ["--robot", str(args.robot)] if args.robot else []
         return shlex.join([*words, "--world", world, "--seed", str(seed)])
 
-    model = compile_model(robot.description)
-    setup = PageSetup(
-        robot, model, sets, list(args.weights), _named(robot), args.world, args.seed, line
-    )
+    texts, named = list(args.weights), _named(robot)
+    setup = PageSetup(robot, sets, texts, named, args.world, args.seed, line)
     here, there = Pipe()
     with workers(1) as pool, opened_server(args.host, args.port) as (server, address):
         process = start_process(simulate, there, jax.tree.map(np.asarray, robot), jobs)

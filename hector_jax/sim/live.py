@@ -14,8 +14,9 @@ from jaxtyping import Float
 
 from hector_jax.control.controller import Plan, WalkConfig
 from hector_jax.control.reference import Anchor, Command, reference_at, with_pieces
+from hector_jax.control.weights import Weights
 from hector_jax.core.headless import mujoco
-from hector_jax.core.trajectory import Trajectory
+from hector_jax.core.trajectory import State, Trajectory
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot, quiet_mujoco
 from hector_jax.sim import sensing
@@ -23,12 +24,14 @@ from hector_jax.sim.diagnosis import BEFORE_FALL, Recorder, likeliest_cause
 from hector_jax.sim.loop import Job, Sample, as_trajectory, first_tick
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import BLOCK, Stepper, joined
-from hector_jax.sim.world import World, build_world
+from hector_jax.sim.world import Imperfections, World, build_world
 
 WINDOW = 4.0  # [s] that are remembered
 PUSH_TIME = 0.2  # [s]
 _NOISE = 20_000  # [ms] after which the estimator's noise repeats itself
 _RECORD = round((BEFORE_FALL + 1.0) / TIME_STEP)  # [ms] before a fall that its cause is found from
+
+_UNITS = np.array([100.0] * 3 + [np.degrees(1.0)] * 3)  # of errors, by metre and radian
 
 _feet = jax.jit(lambda robot, row: sensing.foot_points(robot, sensing.unpack_reading(row)))
 
@@ -49,6 +52,16 @@ class Now(NamedTuple):
     error: Float[np.ndarray, "6"]  # at the last sample
 
 
+class Walked(NamedTuple):
+    """The last seconds of a walk, for a step of a tuning."""
+
+    walk: Trajectory
+    weights: Weights
+    command: Command
+    anchor: Anchor
+    start_tick: int  # gait tick of its first sample
+
+
 class LiveWalk:
     """A walk of one weight set."""
 
@@ -60,41 +73,26 @@ class LiveWalk:
         self._plant = MujocoPlant(job, robot, 0, length, on_step=self._log_step)
         self._states, self._forces = deque(maxlen=_RECORD // 10), deque(maxlen=_RECORD)
         self._stepper = Stepper(config, robot, job, self._plant)
-        self.set_plant(job, payload)
+        self.set_plant(job.imperfections, payload)
         self._ticks = round(WINDOW / config.gait.tick)
         self._blocks: deque[tuple[Plan, Sample]] = deque()  # at least WINDOW and a tick
-        self._away = np.full((1, 6), np.nan)  # errors of the last samples
-        self._squares: deque[np.ndarray] = deque(maxlen=self._ticks)  # of errors, from t = 0
+        self._away = np.full((1, 6), np.nan)  # errors of the last samples from t = 0 on
         self._lead = (job.start_tick - first_tick(config)) * self._stepper.count
         joints, noise = len(robot.joint_lower), job.imperfections.estimator
-        self._errors = sensing.draw_errors(noise, joints, job.seed, self._lead, _NOISE)
+        self._noise = sensing.draw_errors(noise, joints, job.seed, self._lead, _NOISE)
         self._push, self._pushed, self._pending = np.zeros(3), 0, 0
         self.tick()  # so that there is a plan
-
-    @property
-    def anchor(self) -> Anchor:
-        """Where the reference of the command starts."""
-        return self._stepper.anchor
-
-    @property
-    def clock(self) -> int:
-        """The next gait tick."""
-        return self._stepper.clock
-
-    @property
-    def sampled_to(self) -> int:
-        """The gait tick after the last of `trajectory`."""
-        return self.clock - self._pending
 
     def tick(self) -> None:
         """Walk to the next plan; nothing after a fall."""
         if self.fall:
             return
         count = self._stepper.count
-        step = (self.clock - first_tick(self._config)) * count + np.arange(count)
+        step = (self._stepper.clock - first_tick(self._config)) * count + np.arange(count)
         rows = np.where(step < self._lead, step, self._lead + (step - self._lead) % _NOISE)
         self._states.append(self._plant.state())
-        self._stepper.tick(self._errors[rows], np.tile(self._push * (self._pushed > 0), (count, 1)))
+        push = np.tile(self._push * (self._pushed > 0), (count, 1))
+        self._stepper.tick(self._noise[rows], push)
         self._pushed, self._pending = self._pushed - 1, self._pending + 1
         if self._pending == BLOCK or self._plant.broken:
             self._sample()
@@ -104,27 +102,24 @@ class LiveWalk:
         integral = self._config.parameters(job.weights).mpc.integral
         if job.weights is not self.job.weights and not any(integral[:-1]):
             self._stepper.forget_disturbance()  # it would stay as other weights left it
-        self.job = job
+        self.job, self._changed = job, self._stepper.clock
         self._stepper.set_job(job)
 
     def set_command(self, command: Command) -> None:
         """Go on with another command, which starts where the reference is now."""
         self._sample()
-        if self.clock > self.job.start_tick:
-            old = with_pieces(self.job.command)
-            at = jax.device_get(
-                reference_at(self._config.gait.tick, old, self.anchor, float(self.clock))
-            )
-            self._stepper.set_anchor(Anchor(at.position, at.euler[2], np.int32(self.clock)))
+        if (clock := self._stepper.clock) > self.job.start_tick:
+            at = self._reference()
+            self._stepper.set_anchor(Anchor(at.position, at.euler[2], np.int32(clock)))
         self.set_job(self.job._replace(command=command))
 
-    def set_plant(self, job: Job, payload: float) -> None:
-        """Go on with other numbers of the plant, that has no other parts."""
-        world = build_world(job.imperfections, self._robot.description, sensors=True)
+    def set_plant(self, plant: Imperfections, payload: float) -> None:
+        """Go on with other numbers of the plant, which keeps its noise and backlash."""
+        world = build_world(plant, self._robot.description, sensors=True)
         world.model.body_mass[world.trunk] += payload
         mujoco.mj_setConst(world.model, mujoco.MjData(world.model))
         self._plant.world = world
-        self.set_job(job)
+        self.set_job(self.job._replace(imperfections=plant))
 
     def push(self, force: Float[np.ndarray, "3"]) -> None:
         """Push the trunk [N] for PUSH_TIME, as the robot faces: ahead, left, up."""
@@ -138,20 +133,18 @@ class LiveWalk:
         if not self._pending:
             return
         plans, samples = self._stepper.samples()
-        count, self._pending = self._stepper.count, 0
+        self._pending = 0
         self._blocks.append((plans, samples))
         while sum(len(p.residual) for p, _ in list(self._blocks)[1:]) > self._ticks:
             self._blocks.popleft()
-        away = np.hstack([samples.state.position, samples.state.euler])
-        away -= np.hstack([samples.reference.position, samples.reference.euler])
-        away *= [100.0] * 3 + [np.degrees(1.0)] * 3
-        self._away = away
-        squares = (away**2).reshape(len(plans.residual), count, 6)
-        first = self.clock - len(plans.residual) - self.job.start_tick
-        self._squares.extend(squares[max(-first, 0) :] if not samples.fallen.any() else ())
+        since = self._stepper.clock - self.job.start_tick  # t = 0
         if samples.fallen.any() or self._plant.broken:
-            when = (self.clock - self.job.start_tick) * self._config.gait.tick
-            self.fall = f"fell after {when:.1f} s: {self._cause()}"
+            self.fall = f"fell after {since * self._config.gait.tick:.1f} s: {self._cause()}"
+        elif since > 0:
+            walk = self.trajectory()
+            away = np.hstack([walk.state.position, walk.state.euler])
+            away -= np.hstack([walk.reference.position, walk.reference.euler])
+            self._away = (away * _UNITS)[-since * self._stepper.count :]
 
     def _log_step(self, world: World, data: mujoco.MjData) -> None:
         self._forces.append((data.ctrl.copy(), data.xfrc_applied[world.trunk, :3].copy()))
@@ -173,26 +166,37 @@ class LiveWalk:
         samples = jax.tree.map(lambda x: x[-ticks * count - 1 :], samples)
         return as_trajectory(np.array(TIME_STEP), plans, samples, count)
 
+    def log(self) -> Walked | str:
+        """Return the last seconds, or why a tuning cannot step from them."""
+        start = self._stepper.clock - self._pending - self._ticks
+        missing = max(self._changed, self.job.start_tick) - start
+        if self.fall:
+            return "it fell: reset"
+        if missing > 0:
+            return f"{missing * self._config.gait.tick:.1f} s more with nothing moved"
+        anchor = jax.device_get(self._stepper.anchor)
+        return Walked(self.trajectory(), self.job.weights, self.job.command, anchor, start)
+
     def now(self) -> Now:
         """Return where the walk is."""
-        reading, stepper = sensing.unpack_reading(self._stepper.reading), self._stepper
-        errors = np.full(6, np.nan)
-        if self._squares:
-            errors = np.sqrt(np.mean(self._squares, axis=(0, 1)))
-        planned = stepper.last_plan
-        tick = self._config.gait.tick
-        command = with_pieces(self.job.command)
-        reference = reference_at(tick, command, self.anchor, float(self.clock))
+        stepper, tick = self._stepper, self._config.gait.tick
+        reading = sensing.unpack_reading(stepper.reading)
         return Now(
-            time=(self.clock - self.job.start_tick) * tick,
+            time=(stepper.clock - self.job.start_tick) * tick,
             pose=np.concatenate([reading.pose, reading.joints + reading.slack]),
-            reference=np.asarray(reference.position),
+            reference=self._reference().position,
             feet=np.asarray(_feet(self._robot, stepper.reading)),
-            planned=planned.wrench.force,
+            planned=stepper.last_plan.wrench.force,
             measured=self._plant.mean_force(stepper.count),
-            residual=float(planned.residual),
+            residual=float(stepper.last_plan.residual),
             fall=self.fall,
-            seconds=len(self._squares) * tick,
-            errors=errors,
+            seconds=len(self._away) // stepper.count * tick,
+            errors=np.sqrt(np.mean(self._away**2, axis=0)),
             error=self._away[-1],
         )
+
+    def _reference(self) -> State:
+        """Return the reference now."""
+        command, clock = with_pieces(self.job.command), float(self._stepper.clock)
+        tick = self._config.gait.tick
+        return jax.device_get(reference_at(tick, command, self._stepper.anchor, clock))

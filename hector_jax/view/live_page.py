@@ -8,6 +8,7 @@ logarithms and with one weight for all feet.
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from itertools import count
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
 from typing import Any
@@ -15,38 +16,58 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.core.headless import mujoco
 from hector_jax.core.trajectory import FEET, SOLVED
 from hector_jax.report.plots.style import rgb_of
-from hector_jax.sim.live import PUSH_TIME, WINDOW, Now
-from hector_jax.sim.world import MAX_DELAY, WORLDS, Imperfections, named_world
-from hector_jax.view.live import Frame, Walked
-from hector_jax.view.live_tuning import Tuner
+from hector_jax.robot.model import compile_model
+from hector_jax.sim.live import PUSH_TIME, WINDOW, Now, Walked
+from hector_jax.sim.world import MAX_DELAY, WORLDS, named_world
+from hector_jax.view.live import LATE, Frame
+from hector_jax.view.live_tuning import Tuner, Work, take_step, what_matters
 from hector_jax.view.live_weights import PageSetup, WeightsPanel
 from hector_jax.view.motion import INK
-from hector_jax.view.page_parts import add_floor, body_meshes, plot
+from hector_jax.view.page_parts import (
+    DISTANCE,
+    WEIGHT,
+    Bodies,
+    add_arrows,
+    add_floor,
+    add_label,
+    place_camera,
+    plot,
+)
 
-_STRIP = 10.0  # [s] of the errors that are drawn
+_FRAME = 1.0 / 30.0  # [s]
+_PAUSE = 8  # frames between two of which the numbers are shown
+_STRIP = 300  # frames of the errors that are drawn
 _SLOW = 0.95  # share of the wanted speed below which the machine is too slow
-_ARROW = 5 / 6  # length of an arrow for the robot's weight, as a share of its height
 _LOADED = 0.05  # share of the weight on a foot that is worth showing
 _FORCES = {"planned": (25, 25, 30), "measured": (240, 120, 20)}  # colours of arrows
-_SIDES = {"from behind": (1, 0), "from ahead": (-1, 0), "from the right": (0, 1)}
-_SIDES |= {"from the left": (0, -1)}
+_SIDES = {"from behind": (1, 0, 0), "from ahead": (-1, 0, 0), "from the right": (0, 1, 0)}
+_SIDES |= {"from the left": (0, -1, 0)}
+_VELOCITY = (  # sliders: label, largest value, value at the start
+    ("ahead [m/s]", 1.0, 0.5),
+    ("to the left [m/s]", 0.4, 0.0),
+    ("turn left [rad/s]", 1.6, 0.0),
+)
+_NUMBERS = {  # sliders: label, least, largest, step, its units in one of ours
+    "mass": ("mass [times its own]", 0.7, 1.3, 0.01, 1.0),
+    "floor_friction": ("friction of the floor", 0.1, 1.2, 0.01, 1.0),
+    "delay": ("delay of the motors [ms]", 0.0, 1e3 * MAX_DELAY, 0.1, 1e3),
+}
 
 
 def serve_live(server: Any, setup: PageSetup, connection: Connection, tuner: Tuner) -> None:
     """Show frames and do what clients want until interrupted."""
-    page = LivePage(server, setup, connection, tuner)
+    page, due = LivePage(server, setup, connection, tuner), time.monotonic()
     while True:
-        if connection.poll(0.02):
-            message = connection.recv()
-            if isinstance(message, Frame):
-                page.show(message)
-                connection.send(("taken", ()))
-            else:
-                page.tune(message)
+        connection.send(("frame", ()))
+        while not isinstance(message := connection.recv(), Frame):
+            page.tune(message)
+        page.show(message)
         page.work()
+        now = time.monotonic()
+        due = max(due + _FRAME, now - LATE)
+        time.sleep(max(due - now, 0.0))
 
 
 class LivePage:
@@ -57,10 +78,9 @@ class LivePage:
         self._server, self._setup, self._tuner = server, setup, tuner
         self._send = lambda name, *values: connection.send((name, values))
         self._calls: SimpleQueue[Callable[[], None]] = SimpleQueue()
-        self._names = list(setup.sets)
-        self._plant = named_world(setup.world, setup.seed, setup.robot.description)
-        self._strips = [deque[tuple[float, ...]]() for _ in self._names]
-        self._data, self._next, self._moved = mujoco.MjData(setup.model), 0.0, False
+        self._names, self._frames = list(setup.sets), count()
+        self._strip = deque[np.ndarray](maxlen=_STRIP)  # time, errors of each set
+        self._moved = False  # something that is not in the line that repeats the page
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
         self._status = server.gui.add_markdown("")
@@ -76,9 +96,9 @@ class LivePage:
         while not self._calls.empty():
             self._calls.get()()
         if (found := self._tuner.found()) is not None:
-            self._found.content = found.text
-            if found.weights is not None:
-                self._weights.set(found.set, found.weights)
+            i, weights, self._found.content = found
+            if weights is not None:
+                self._weights.set(i, weights)
 
     def _when(self, handle: Any, do: Callable[..., None]) -> Any:
         """Let `do` be called, by the loop, with what a client chose of a handle."""
@@ -101,37 +121,31 @@ class LivePage:
     # The panel
 
     def _add_walk(self) -> None:
-        gui, sent, velocity = self._server.gui, self._send, {}
+        gui, when, send = self._server.gui, self._when, self._send
         with gui.add_folder("Walk"):
-            self._run = self._when(gui.add_button("Stop"), self._stop)
-            self._when(gui.add_button("Reset: stand at the start again"), lambda _: self._reset())
+            run = gui.add_button("Stop")
+            when(gui.add_button("Reset: stand at the start again"), lambda _: send("reset"))
             speed = gui.add_slider("speed [real time]", 0.1, 2.0, 0.1, 1.0)
-            self._when(speed, lambda value: sent("set_speed", value))
-
-            def command(_: Any) -> None:
-                sent("set_velocity", *(handle.value for handle in velocity.values()))
-                self._moved = True
-
-            rows = ("ahead [m/s]", 1.0, 0.5), ("to the left [m/s]", 0.4, 0.0)
-            for name, most, start in (*rows, ("turn left [rad/s]", 1.6, 0.0)):
-                slider = gui.add_slider(name, -most, most, 0.05, start)
-                velocity[name] = self._when(slider, command)
+            velocity = [gui.add_slider(n, -most, most, 0.05, at) for n, most, at in _VELOCITY]
             newtons = gui.add_slider("push [N]", 10.0, 400.0, 10.0, 60.0)
             sides = gui.add_button_group(f"push {PUSH_TIME:g} s", list(_SIDES))
-            self._when(
-                sides,
-                lambda side: sent("push", newtons.value * np.array([*_SIDES[side], 0.0])),
-            )
 
-    def _stop(self, _: Any) -> None:
-        running = self._run.label != "Stop"
-        self._run.label = "Stop" if running else "Go on"
-        self._send("run", running)
+        def pace(_: Any) -> None:
+            send("set_speed", speed.value * (run.label == "Stop"))
 
-    def _reset(self) -> None:
-        for strip in self._strips:
-            strip.clear()
-        self._send("reset")
+        def stop(_: Any) -> None:
+            run.label = "Go on" if run.label == "Stop" else "Stop"
+            pace(None)
+
+        def command(_: Any) -> None:
+            send("set_velocity", *(slider.value for slider in velocity))
+            self._moved = True
+
+        when(run, stop)
+        when(speed, pace)
+        when(sides, lambda side: send("push", newtons.value * np.array(_SIDES[side])))
+        for slider in velocity:
+            when(slider, command)
 
     def _add_errors(self) -> None:
         gui = self._server.gui
@@ -146,167 +160,136 @@ class LivePage:
             self._plots = [plot(gui, title, "time [s]", np.zeros(1), empty) for title in titles]
 
     def _add_tuning(self) -> None:
-        gui = self._server.gui
+        gui, when = self._server.gui, self._when
         with gui.add_folder("Tuning"):
-            self._when(
-                gui.add_button("Tune from here: one Gauss-Newton step"), lambda _: self._ask("step")
-            )
-            self._when(
-                gui.add_button("Which weights matter in this walk?"), lambda _: self._ask("matter")
-            )
+            step = gui.add_button("Tune from here: one Gauss-Newton step")
+            when(step, lambda _: self._ask(take_step))
+            matter = gui.add_button("Which weights matter in this walk?")
+            when(matter, lambda _: self._ask(what_matters))
             self._found = gui.add_markdown("")
 
     def _add_plant(self) -> None:
-        gui, setup, plant = self._server.gui, self._setup, self._plant
+        gui, setup, send = self._server.gui, self._setup, self._send
         with gui.add_folder("Plant", expand_by_default=False):
             world = gui.add_dropdown("world", WORLDS, initial_value=setup.world)
             seed = gui.add_number("seed", setup.seed, min=0, step=1)
-            mass = gui.add_slider("mass [times its own]", 0.7, 1.3, 0.01, float(plant.mass))
-            friction = gui.add_slider("friction of the floor", 0.1, 1.2, 0.01, 0.8)
-            delay = gui.add_slider("delay of the motors [ms]", 0.0, 1e3 * MAX_DELAY, 0.1, 0.0)
+            numbers = {
+                name: (gui.add_slider(label, low, high, step, low), units)
+                for name, (label, low, high, step, units) in _NUMBERS.items()
+            }
             payload = gui.add_slider("payload on the trunk [kg]", 0.0, 10.0, 0.1, 0.0)
 
-            def show(plant: Imperfections) -> None:
-                self._plant = plant
-                mass.value, friction.value = float(plant.mass), float(plant.floor_friction)
-                delay.value = 1e3 * float(plant.delay)
+        def show() -> None:
+            self._setup = setup._replace(world=world.value, seed=int(seed.value))
+            self._plant = named_world(world.value, self._setup.seed, setup.robot.description)
+            for name, (slider, units) in numbers.items():
+                slider.value = units * float(getattr(self._plant, name))
 
-            def draw(_: Any) -> None:
-                show(named_world(world.value, int(seed.value), setup.robot.description))
-                self._setup = setup._replace(world=world.value, seed=int(seed.value))
-                self._send("set_plant", self._plant, payload.value)
+        def draw(_: Any) -> None:
+            show()
+            send("set_world", self._plant, self._setup.seed)
 
-            def change(_: Any) -> None:
-                self._plant = self._plant._replace(
-                    mass=np.asarray(mass.value),
-                    floor_friction=np.asarray(friction.value),
-                    delay=np.asarray(1e-3 * delay.value),
-                )
-                self._moved = True
-                self._send("set_plant", self._plant, payload.value)
+        def change(_: Any) -> None:
+            values = {name: np.asarray(x.value / units) for name, (x, units) in numbers.items()}
+            self._plant = self._plant._replace(**values)
+            send("set_numbers", self._plant, payload.value)
+            self._moved = True
 
-            show(plant)
-            for handle in (world, seed):
-                self._when(handle, draw)
-            for handle in (mass, friction, delay, payload):
-                self._when(handle, change)
+        show()
+        for handle in (world, seed):
+            self._when(handle, draw)
+        for handle in (*(slider for slider, _ in numbers.values()), payload):
+            self._when(handle, change)
 
     # Tuning
 
-    def _ask(self, what: str) -> None:
-        self._wanted = what, self._weights.chosen
+    def _ask(self, work: Work) -> None:
+        self._wanted = work, self._weights.chosen
         self._found.content = "computing, the first time on a machine for a minute ..."
-        self._send("log", self._wanted[1])
+        self._send("log", self._weights.chosen)
 
     def tune(self, walked: Walked | str) -> None:
         """Compute what a client asked for from a walk, or show why that cannot be."""
-        what, i = self._wanted
         if isinstance(walked, str):
             self._found.content = f"Not yet: {walked}."
         else:
-            self._tuner.start(what, i, walked)
+            self._tuner.start(*self._wanted, walked)
 
     # The scene
 
     def _build_world(self) -> None:
-        scene, height = self._server.scene, float(self._setup.robot.standing_height)
-        scene.set_up_direction("+z")
-        camera, side = self._server.initial_camera, np.deg2rad(-50.0)
-        camera.look_at = (0.0, 0.0, 0.76 * height)
-        camera.position = tuple(height * np.array([3.8 * np.cos(side), 3.8 * np.sin(side), 1.8]))
+        scene, robot = self._server.scene, self._setup.robot
+        height, feet = float(robot.standing_height), range(len(robot.foot_point))
+        model, edges = compile_model(robot.description), np.zeros((8, 2, 3), np.float32)
+        place_camera(self._server, height)
         (self._world, self._floor), self._handles = add_floor(scene), []
         for i, (name, colour) in enumerate(zip(self._names, rgb_of(self._names), strict=True)):
-            root, across = f"/world/{i}", (len(self._names) - 1) / 2 - i
-            scene.add_frame(root, show_axes=False, position=(0.0, 1.9 * height * across, 0.0))
-            meshes = body_meshes(self._setup.model, colour).items()
-            bodies = {b: scene.add_mesh_trimesh(f"{root}/body{b}", mesh) for b, mesh in meshes}
+            root, across = f"/world/{i}", DISTANCE * height * ((len(self._names) - 1) / 2 - i)
+            scene.add_frame(root, show_axes=False, position=(0.0, across, 0.0))
             # a label that moves lags behind: the robots stay near it, while the world moves
-            above = (0.0, 1.9 * height * across, 2.0 * height)
-            label = {"anchor": "bottom-center", "font_screen_scale": 1.4, "position": above}
-            scene.add_label(f"/name{i}", name, **label)
+            add_label(scene, f"/name{i}", name).position = (0.0, across, 2.0 * height)
+            # each foot has arrows and a cone, from the origin of their own frames
+            parts: dict[str, list[Any]] = {
+                kind: [add_arrows(scene, f"{root}/{kind}{foot}", shade, height) for foot in feet]
+                for kind, shade in _FORCES.items()
+            }
+            add, shade = scene.add_line_segments, _FORCES["measured"]
+            parts["cones"] = [add(f"{root}/cone{f}", edges, shade, thickness=0.004) for f in feet]
+            aim = scene.add_icosphere(f"{root}/aim", 0.018, INK)
             self._handles.append(
-                {
-                    "bodies": bodies,
-                    "arrows": [self._add_arrows(f"{root}/{kind}", kind) for kind in _FORCES],
-                    "cones": self._add_cones(f"{root}/cone"),
-                    "aim": scene.add_icosphere(f"{root}/aim", 0.018, INK),
-                }
+                {"bodies": Bodies(scene, root, model, colour), "aim": aim, **parts}
             )
 
-    def _add_arrows(self, root: str, kind: str) -> list[Any]:
-        """Add an arrow for each foot, that starts at the origin of its own frame."""
-        robot = self._setup.robot
-        height, points = float(robot.standing_height), np.zeros((1, 2, 3), np.float32)
-        radius = 0.019 * height
-        size = {"shaft_radius": radius, "head_radius": 2.3 * radius, "head_length": 0.083 * height}
-        feet = range(len(robot.foot_point))
-        add = self._server.scene.add_arrows
-        return [add(f"{root}{foot}", points, _FORCES[kind], **size) for foot in feet]
-
-    def _add_cones(self, root: str) -> list[Any]:
-        """Add the edges of the friction cone of each foot, as high as the force on it."""
-        edges, colours = np.zeros((8, 2, 3), np.float32), _FORCES["measured"]
-        add = self._server.scene.add_line_segments
-        feet = range(len(self._setup.robot.foot_point))
-        return [add(f"{root}{foot}", edges, colours, thickness=0.004) for foot in feet]
-
     def show(self, frame: Frame) -> None:
-        """Show a frame; numbers and strips four times a second."""
+        """Show a frame; numbers and errors over time in some of them."""
         aim = frame.walks[0].reference * [1.0, 1.0, 0.0]
         with self._server.atomic():
             self._world.position, self._floor.position = -aim, 5.0 * np.round(aim / 5.0)
             for now, handles in zip(frame.walks, self._handles, strict=True):
                 self._draw(now, handles)
-        for strip, now in zip(self._strips, frame.walks, strict=True):
-            # before the path begins there is no error, and with a NaN the page draws no line at all
-            if np.isfinite(now.error).all() and (not strip or now.time > strip[-1][0]):
-                off = np.hypot(*now.error[:2]), np.hypot(*now.error[3:5])
-                strip.append((now.time, *off))
-                while strip[0][0] < now.time - _STRIP:
-                    strip.popleft()
-        if time.monotonic() >= self._next:
-            self._next = time.monotonic() + 0.25
+        off, strip = np.array([now.error for now in frame.walks]), self._strip
+        row = max(now.time for now in frame.walks), *_norms(off[:, :2]), *_norms(off[:, 3:5])
+        if strip and row[0] < strip[-1][0]:
+            strip.clear()
+        # before the path begins there is no error, and with a NaN the page draws no line at all
+        if np.isfinite(row).all() and (not strip or row[0] > strip[-1][0]):
+            strip.append(np.array(row))
+        if next(self._frames) % _PAUSE == 0:
             self._show_numbers(frame)
 
     def _draw(self, now: Now, handles: dict[str, Any]) -> None:
         robot = self._setup.robot
-        height, weight = float(robot.standing_height), float(robot.mass * robot.gravity[2])
-        self._data.qpos[:] = now.pose
-        mujoco.mj_kinematics(self._setup.model, self._data)
-        for body, handle in handles["bodies"].items():
-            handle.position = self._data.xpos[body].copy()
-            handle.wxyz = self._data.xquat[body].copy()
-        for arrows, forces in zip(handles["arrows"], (now.planned, now.measured), strict=True):
-            for arrow, foot, force in zip(arrows, now.feet, forces, strict=True):
-                arrow.position, arrow.visible = foot, bool(force[2] > _LOADED * weight)
-                if arrow.visible:
-                    end = _ARROW * height / weight * force
-                    arrow.points = np.stack([np.zeros(3), end])[None].astype(np.float32)
-        for cone, foot, force in zip(handles["cones"], now.feet, now.measured, strict=True):
-            cone.position, cone.visible = foot, bool(force[2] > _LOADED * weight)
-            if cone.visible:
-                up = _ARROW * height / weight * force[2]
-                cone.points = up * _cone_edges(float(self._plant.floor_friction))
+        weight = float(robot.mass * robot.gravity[2])
+        scale = WEIGHT * float(robot.standing_height) / weight
+        cone = _cone_edges(float(self._plant.floor_friction))
+        kinds = {
+            "planned": (now.planned, lambda force: np.stack([0.0 * force, force])[None]),
+            "measured": (now.measured, lambda force: np.stack([0.0 * force, force])[None]),
+            "cones": (now.measured, lambda force: force[2] * cone),
+        }
+        for kind, (forces, points) in kinds.items():
+            for handle, foot, force in zip(handles[kind], now.feet, forces, strict=True):
+                handle.position, handle.visible = foot, bool(force[2] > _LOADED * weight)
+                if handle.visible:
+                    handle.points = points(scale * force).astype(np.float32)
+        handles["bodies"].move(now.pose)
         handles["aim"].position = now.reference
 
     def _show_numbers(self, frame: Frame) -> None:
-        slow = frame.wanted > 0.0 and frame.factor < _SLOW * frame.wanted
         lines = [f"Real-time factor {frame.factor:.2f}" if frame.wanted else "Stopped."]
-        if slow:
+        if frame.factor < _SLOW * frame.wanted:
             lines[0] += f": **this machine is too slow** for speed {frame.wanted:g}"
         rows = ["| | x, y, z [cm] | roll, pitch, yaw [°] |", "|---|---|---|"]
-        sets = zip(self._names, frame.walks, frame.starts, strict=True)
-        for name, now, first in sets:
+        for name, now, first in zip(self._names, frame.walks, frame.starts, strict=True):
             lines.append(f"**{name}**: {self._state_text(now)}")
             rows.append(_row(f"**{name}** now", now.errors))
-            if first is not None and first is not now.errors:
+            if first is not None:
                 rows.append(_row(f"{name} at the start", first))
         self._status.content, self._table.content = "\n\n".join(lines), "\n".join(rows)
-        if min(map(len, self._strips)) > 1:
-            count = min(map(len, self._strips))
-            data = np.array([list(strip)[-count:] for strip in self._strips])
+        if len(self._strip) > 1:
+            times, *off = np.transpose(self._strip)
             for k, handle in enumerate(self._plots):
-                handle.data = (data[0, :, 0], *data[:, :, k + 1])
+                handle.data = (times, *off[k * len(self._names) :][: len(self._names)])
 
     def _state_text(self, now: Now) -> str:
         if now.fall:
@@ -314,13 +297,16 @@ class LivePage:
         mu, robot, text = float(self._plant.floor_friction), self._setup.robot, []
         for foot, force in zip(FEET[len(now.measured)], now.measured, strict=True):
             if force[2] > _LOADED * float(robot.mass * robot.gravity[2]):
-                share = np.abs(force[:2]).sum() / (mu * force[2])  # the cone is a diamond
-                text.append(
-                    f"{foot.replace('_', ' ')} {force[2]:.0f} N, {100 * share:.0f} % of friction"
-                )
+                share = 100.0 * np.abs(force[:2]).sum() / (mu * force[2])  # the cone is a diamond
+                words = foot.replace("_", " ")
+                text.append(f"{words} {force[2]:.0f} N, {share:.0f} % of friction")
         solved = now.residual <= SOLVED
         qp = "QP solved" if solved else f"**QP not solved**, residual {now.residual:.0e}"
         return f"{now.time:.1f} s; {qp}; " + ("; ".join(text) or "in the air")
+
+
+def _norms(rows: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+    return np.hypot(*rows.T)
 
 
 def _cone_edges(mu: float) -> Float[np.ndarray, "8 2 3"]:
