@@ -58,12 +58,11 @@ from hector_jax.core.settings import check
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.report.plots.style import drawing, label_of, looks_of
 from hector_jax.robot.model import Robot
+from hector_jax.sim.live import Call, Session
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections
 from hector_jax.verdict.foretell import HERE, calibrated
-from hector_jax.view.live import Call, Session
 from hector_jax.view.live_page import LivePage
-from hector_jax.view.live_tuning import Tuner
 from hector_jax.view.live_weights import PageSetup
 from hector_jax.view.motion import motions
 from hector_jax.view.page import opened_server
@@ -259,7 +258,7 @@ def _live_page(
     named = {"nominal": nominal(), "expert": expert(), "shipped": shipped()}
     setup = PageSetup(robot, sets, list(sets), named, "hfs", 0, lambda *_: "")
     with opened_server("127.0.0.1", 8765) as (server, address):
-        page = LivePage(server, setup, _Direct(session), Tuner(None, robot))  # pyright: ignore
+        page = LivePage(server, setup, _Direct(session), None)  # pyright: ignore
 
         def go(seconds: float) -> None:
             ticks, spent = round(seconds / session.config.gait.tick), 0.0

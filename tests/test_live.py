@@ -19,10 +19,10 @@ from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal, weights_to_vector
 from hector_jax.control.weights_file import load_weights, shipped, weights_tree
+from hector_jax.sim.live import Session
 from hector_jax.sim.world import hfs, hfs_even
-from hector_jax.view.live import Session
+from hector_jax.tuning.live import take_step, what_matters
 from hector_jax.view.live_page import LivePage
-from hector_jax.view.live_tuning import Tuner, take_step, what_matters
 from hector_jax.view.live_weights import PageSetup
 from hector_jax.view.page import opened_server
 
@@ -181,7 +181,7 @@ def test_a_page_shows_what_the_walk_is_at_and_turns_undoes_and_saves_weights(mon
     setup = PageSetup(ROBOT, sets, ["nominal"], named, "hfs", 0, line)
     go(found, 0.5)
     with opened_server("127.0.0.1", 0) as (server, _):
-        page = LivePage(server, setup, Wire(found), Tuner(HandsOver(), ROBOT))
+        page = LivePage(server, setup, Wire(found), HandsOver())
         page.show(found.frame()._replace(factor=0.4))
         assert "0.40: **this machine is too slow** for speed 1" in page._status.content
         assert "**nominal**: 0.5 s; QP solved; " in page._status.content

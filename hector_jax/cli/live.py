@@ -16,11 +16,10 @@ from hector_jax.core.console import Broken, say
 from hector_jax.core.inputs import InputError, require_package
 from hector_jax.core.pool import start_process, workers
 from hector_jax.robot.model import Robot, load_robot
+from hector_jax.sim.live import simulate
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import WORLDS, named_world
-from hector_jax.view.live import simulate
 from hector_jax.view.live_page import serve_live
-from hector_jax.view.live_tuning import Tuner
 from hector_jax.view.live_weights import PageSetup
 from hector_jax.view.page import opened_server
 
@@ -40,7 +39,7 @@ def run_live(args: View) -> None:
     if len(args.weights) > 2:
         raise InputError(f"--weights of a live walk are one or two, got {len(args.weights)}")
     require_package("viser", "view", "the page")
-    robot = load_robot(args.robot)
+    robot = jax.tree.map(np.asarray, load_robot(args.robot))  # can be sent to a process
     if robot.description.numbers:
         text = "[numbers] are of a controller of your own, whose program is not walked live"
         raise InputError(f"{robot.description.path}: {text}")
@@ -59,11 +58,11 @@ def run_live(args: View) -> None:
     setup = PageSetup(robot, sets, texts, named, args.world, args.seed, line)
     here, there = Pipe()
     with workers(1) as pool, opened_server(args.host, args.port) as (server, address):
-        process = start_process(simulate, there, jax.tree.map(np.asarray, robot), jobs)
+        process = start_process(simulate, there, robot, jobs)
         there.close()
         say(f"open {address} in a browser; Ctrl-C ends it")
         try:
-            serve_live(server, setup, here, Tuner(pool, jax.tree.map(np.asarray, robot)))
+            serve_live(server, setup, here, pool)
         except (EOFError, ConnectionError):
             raise Broken("the process in which the robot walks has ended") from None
         finally:

@@ -1,13 +1,14 @@
 """The page of a live walk: robots, what they are at, and all that a person can turn.
 
 All clients see one page. What they click or move is done in turn by the loop of `serve_live`; the
-robots walk in another process (`view.live`). Weights are moved as a tuning moves them, by their
+robots walk in another process (`sim.live`). Weights are moved as a tuning moves them, by their
 logarithms and with one weight for all feet.
 """
 
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future
 from itertools import count
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
@@ -16,13 +17,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import FEET, SOLVED
 from hector_jax.report.plots.style import rgb_of
 from hector_jax.robot.model import compile_model
-from hector_jax.sim.live import PUSH_TIME, WINDOW, Now, Walked
+from hector_jax.sim.live import LATE, PUSH_TIME, WINDOW, Frame, Now, Walked
 from hector_jax.sim.world import MAX_DELAY, WORLDS, named_world
-from hector_jax.view.live import LATE, Frame
-from hector_jax.view.live_tuning import Tuner, Work, take_step, what_matters
+from hector_jax.tuning.difftune import TuneState
+from hector_jax.tuning.live import Work, take_step, what_matters
 from hector_jax.view.live_weights import PageSetup, WeightsPanel
 from hector_jax.view.motion import INK
 from hector_jax.view.page_parts import (
@@ -56,9 +58,9 @@ _NUMBERS = {  # sliders: label, least, largest, step, its units in one of ours
 }
 
 
-def serve_live(server: Any, setup: PageSetup, connection: Connection, tuner: Tuner) -> None:
-    """Show frames and do what clients want until interrupted."""
-    page, due = LivePage(server, setup, connection, tuner), time.monotonic()
+def serve_live(server: Any, setup: PageSetup, connection: Connection, pool: Executor) -> None:
+    """Show frames and do what clients want until interrupted; a process of the pool tunes."""
+    page, due = LivePage(server, setup, connection, pool), time.monotonic()
     while True:
         connection.send(("frame", ()))
         while not isinstance(message := connection.recv(), Frame):
@@ -73,13 +75,15 @@ def serve_live(server: Any, setup: PageSetup, connection: Connection, tuner: Tun
 class LivePage:
     """The page in the browser."""
 
-    def __init__(self, server: Any, setup: PageSetup, connection: Connection, tuner: Tuner) -> None:
-        """Build the page on a `viser.ViserServer`."""
-        self._server, self._setup, self._tuner = server, setup, tuner
+    def __init__(self, server: Any, setup: PageSetup, connection: Connection, pool: Any) -> None:
+        """Build the page on a `viser.ViserServer`; other arguments as in `serve_live`."""
+        self._server, self._setup, self._pool = server, setup, pool
         self._send = lambda name, *values: connection.send((name, values))
         self._calls: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._names, self._frames = list(setup.sets), count()
-        self._strip = deque[np.ndarray](maxlen=_STRIP)  # time, errors of each set
+        self._strip = deque[tuple[float, ...]](maxlen=_STRIP)  # see `_note`
+        self._states: dict[int, TuneState] = {}  # of the tuner, by number of the set
+        self._job: Future[Any] | None = None  # what is computed, of the last that was asked for
         self._moved = False  # something that is not in the line that repeats the page
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
@@ -95,8 +99,13 @@ class LivePage:
         """Do what clients have wanted since, and show what a tuning found."""
         while not self._calls.empty():
             self._calls.get()()
-        if (found := self._tuner.found()) is not None:
-            i, weights, self._found.content = found
+        if self._job is not None and self._job.done():
+            job, self._job = self._job, None
+            if isinstance(error := job.exception(), InputError):
+                self._found.content = str(error)
+                return
+            i = self._wanted[1]
+            self._states[i], weights, self._found.content = job.result()
             if weights is not None:
                 self._weights.set(i, weights)
 
@@ -204,16 +213,18 @@ class LivePage:
     # Tuning
 
     def _ask(self, work: Work) -> None:
-        self._wanted = work, self._weights.chosen
-        self._found.content = "computing, the first time on a machine for a minute ..."
-        self._send("log", self._weights.chosen)
+        if self._job is None:
+            self._wanted = work, self._weights.chosen
+            self._found.content = "computing, the first time on a machine for a minute ..."
+            self._send("log", self._weights.chosen)
 
     def tune(self, walked: Walked | str) -> None:
         """Compute what a client asked for from a walk, or show why that cannot be."""
         if isinstance(walked, str):
             self._found.content = f"Not yet: {walked}."
-        else:
-            self._tuner.start(*self._wanted, walked)
+        elif self._job is None:
+            work, i = self._wanted
+            self._job = self._pool.submit(work, self._setup.robot, self._states.get(i), walked)
 
     # The scene
 
@@ -247,15 +258,20 @@ class LivePage:
             self._world.position, self._floor.position = -aim, 5.0 * np.round(aim / 5.0)
             for now, handles in zip(frame.walks, self._handles, strict=True):
                 self._draw(now, handles)
-        off, strip = np.array([now.error for now in frame.walks]), self._strip
-        row = max(now.time for now in frame.walks), *_norms(off[:, :2]), *_norms(off[:, 3:5])
-        if strip and row[0] < strip[-1][0]:
-            strip.clear()
-        # before the path begins there is no error, and with a NaN the page draws no line at all
-        if np.isfinite(row).all() and (not strip or row[0] > strip[-1][0]):
-            strip.append(np.array(row))
+        self._note(frame.walks)
         if next(self._frames) % _PAUSE == 0:
             self._show_numbers(frame)
+
+    def _note(self, walks: Sequence[Now]) -> None:
+        """Add to the strip the time, and the errors in the plane and of roll and pitch together."""
+        off = np.reshape([now.error for now in walks], (-1, 2, 3))[..., :2]
+        row = max(now.time for now in walks), *np.linalg.norm(off, axis=2).T.ravel()
+        last = self._strip[-1][0] if self._strip else -np.inf
+        if row[0] < last:
+            self._strip.clear()  # after a reset
+        # before the path begins there is no error, and with a NaN the page draws no line at all
+        elif row[0] > last and np.isfinite(row).all():
+            self._strip.append(row)
 
     def _draw(self, now: Now, handles: dict[str, Any]) -> None:
         robot = self._setup.robot
@@ -303,10 +319,6 @@ class LivePage:
         solved = now.residual <= SOLVED
         qp = "QP solved" if solved else f"**QP not solved**, residual {now.residual:.0e}"
         return f"{now.time:.1f} s; {qp}; " + ("; ".join(text) or "in the air")
-
-
-def _norms(rows: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    return np.hypot(*rows.T)
 
 
 def _cone_edges(mu: float) -> Float[np.ndarray, "8 2 3"]:

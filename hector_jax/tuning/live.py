@@ -1,14 +1,12 @@
 """One step of the tuner from the walk just seen, and what of the weights matters in it.
 
-The rigid body is grounded on the last seconds of the walk (`tuning.grounded`), in a process beside
-the walk. Steps, acceptance and trust region are those of `difftune`; the state goes on from step to
-step while the weights are those that it proposed.
+The rigid body is grounded on the last seconds of the walk (`grounded`). Steps, acceptance and trust
+region are those of `difftune`; the state goes on from step to step while the weights are those that
+it proposed.
 """
 
 from collections.abc import Callable
-from concurrent.futures import Executor, Future
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +18,6 @@ from hector_jax.control.reference import with_pieces
 from hector_jax.control.weights import Weights
 from hector_jax.control.weights_file import weights_tree
 from hector_jax.core.arrays import Array
-from hector_jax.core.inputs import InputError
 from hector_jax.grfm import network
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.robot.model import Robot
@@ -101,29 +98,3 @@ def _rms(config: RolloutConfig, grounding: Grounding, weights: Weights) -> Float
     walk = grounded_rollout(config, grounding, weights)
     state, reference = (jnp.hstack([x.position, x.euler]) for x in (walk.state, walk.reference))
     return jnp.sqrt(jnp.mean((state - reference) ** 2, axis=0))
-
-
-class Tuner:
-    """Steps and directions, computed in a process beside the page."""
-
-    def __init__(self, pool: Executor, robot: Robot) -> None:
-        """Compute by a process of the pool."""
-        self._pool, self._robot = pool, robot
-        self._states: dict[int, TuneState] = {}  # by number of the set
-        self._running: tuple[int, Future[Any]] | None = None
-
-    def start(self, work: Work, i: int, walked: Walked) -> None:
-        """Begin to compute for set `i`, unless something is being computed."""
-        if self._running is None:
-            inputs = self._robot, self._states.get(i), walked
-            self._running = i, self._pool.submit(work, *inputs)
-
-    def found(self) -> tuple[int, Weights | None, str] | None:
-        """Return what was computed since, or None: set, its next weights if it was a step, text."""
-        if self._running is None or not self._running[1].done():
-            return None
-        (i, job), self._running = self._running, None
-        if isinstance(error := job.exception(), InputError):
-            return i, None, str(error)
-        self._states[i], weights, text = job.result()
-        return i, weights, text
