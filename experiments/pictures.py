@@ -256,7 +256,7 @@ def _live_page(
     session = Session(robot, [Job(weights, command, plant) for weights in sets.values()])
     session.warm_up()
     named = {"nominal": nominal(), "expert": expert(), "shipped": shipped()}
-    setup = PageSetup(robot, sets, list(sets), named, "hfs", 0, lambda *_: "")
+    setup = PageSetup(robot, sets, list(sets), named, "hfs", 0, {}, str)
     with opened_server("127.0.0.1", 8765) as (server, address):
         page = LivePage(server, setup, _Direct(session), None)  # pyright: ignore
 

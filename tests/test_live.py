@@ -150,6 +150,9 @@ def test_what_is_not_live_is_refused_in_a_line(monkeypatch, capsys, tmp_path):
         tmp_path, "--robot", EXAMPLES / "quadruped/robot.toml"
     )
     assert "--seconds is of a run" in line("--live", "--seconds", 2)
+    assert "--at mass must be a number from 0.7 to 1.3, got '9'" in line("--live", "--at", "mass=9")
+    assert "unknown number 'mas'; did you mean 'mass'?" in line("--live", "--at", "mas=1")
+    assert "--at is of a live walk: --live" in line(tmp_path, "--at", "mass=1")
     assert "it tunes; got standin" in line("--live", "--world", "standin")
     own = EXAMPLES / "own_controller" / "numbers.toml"
     assert "whose program is not walked live" in line("--live", "--robot", own)
@@ -174,14 +177,18 @@ def test_a_page_shows_what_the_walk_is_at_and_turns_undoes_and_saves_weights(mon
     monkeypatch.chdir(tmp_path)
     found, named = Session(ROBOT, [job()]), {"nominal": nominal(ROBOT), "expert": expert(ROBOT)}
 
-    def line(files, world, seed):
-        return f"hector view --live --weights {' '.join(files)} --world {world} --seed {seed}"
+    def line(weights, at, world="hfs", seed=0):
+        line = f"hector view --live --weights {' '.join(weights)} --world {world} --seed {seed}"
+        return f"{line} --at {' '.join(at)}"
 
     sets = {"nominal": nominal(ROBOT)}
-    setup = PageSetup(ROBOT, sets, ["nominal"], named, "hfs", 0, line)
+    at = {"ahead": 0.3, "mass": 1.1}
+    setup = PageSetup(ROBOT, sets, ["nominal"], named, "hfs", 0, at, line)
     go(found, 0.5)
     with opened_server("127.0.0.1", 0) as (server, _):
         page = LivePage(server, setup, Wire(found), HandsOver())
+        assert found.walks[0].job.command.velocity.tolist() == [[0.3, 0.0]] * 2
+        assert float(found.walks[0].job.imperfections.mass) == 1.1
         page.show(found.frame()._replace(factor=0.4))
         assert "0.40: **this machine is too slow** for speed 1" in page._status.content
         assert "**nominal**: 0.5 s; QP solved; " in page._status.content
@@ -199,7 +206,8 @@ def test_a_page_shows_what_the_walk_is_at_and_turns_undoes_and_saves_weights(mon
         assert found.walks[0].job.weights.Q.euler[1] == pytest.approx(100.0)
         page._weights._save()
         assert (
-            "hector view --live --weights live.json --world hfs --seed 0"
+            "hector view --live --weights live.json --world hfs --seed 0 --at ahead=0.3 mass=1.1 "
+            "aside=0.0 turn=0.0 floor_friction=0.8 delay=0.002 payload=0.0\n"
             in page._weights._line.content
         )
         saved = load_weights(tmp_path / "live.json", ROBOT)

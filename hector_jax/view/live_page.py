@@ -7,7 +7,7 @@ logarithms and with one weight for all feet.
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from itertools import count
 from multiprocessing.connection import Connection
@@ -34,7 +34,7 @@ from hector_jax.view.page_parts import (
     add_arrows,
     add_floor,
     add_label,
-    place_camera,
+    lay_out,
     plot,
 )
 
@@ -46,16 +46,17 @@ _LOADED = 0.05  # share of the weight on a foot that is worth showing
 _FORCES = {"planned": (25, 25, 30), "measured": (240, 120, 20)}  # colours of arrows
 _SIDES = {"from behind": (1, 0, 0), "from ahead": (-1, 0, 0), "from the right": (0, 1, 0)}
 _SIDES |= {"from the left": (0, -1, 0)}
-_VELOCITY = (  # sliders: label, largest value, value at the start
-    ("ahead [m/s]", 1.0, 0.5),
-    ("to the left [m/s]", 0.4, 0.0),
-    ("turn left [rad/s]", 1.6, 0.0),
-)
-_NUMBERS = {  # sliders: label, least, largest, step, its units in one of ours
-    "mass": ("mass [times its own]", 0.7, 1.3, 0.01, 1.0),
-    "floor_friction": ("friction of the floor", 0.1, 1.2, 0.01, 1.0),
-    "delay": ("delay of the motors [ms]", 0.0, 1e3 * MAX_DELAY, 0.1, 1e3),
+NUMBERS = {  # sliders of command and plant: label, least, largest value, step
+    "ahead": ("ahead [m/s]", -1.0, 1.0, 0.05),
+    "aside": ("to the left [m/s]", -0.4, 0.4, 0.05),
+    "turn": ("turn left [rad/s]", -1.6, 1.6, 0.05),
+    "mass": ("mass [times its own]", 0.7, 1.3, 0.01),
+    "floor_friction": ("friction of the floor", 0.1, 1.2, 0.01),
+    "delay": ("delay of the motors [s]", 0.0, MAX_DELAY, 1e-4),
+    "payload": ("payload on the trunk [kg]", 0.0, 10.0, 0.1),
 }
+_COMMAND = {"ahead": 0.5, "aside": 0.0, "turn": 0.0}  # at the start
+_PLANT = "mass", "floor_friction", "delay"  # those in `Imperfections`
 
 
 def serve_live(server: Any, setup: PageSetup, connection: Connection, pool: Executor) -> None:
@@ -84,9 +85,7 @@ class LivePage:
         self._strip = deque[tuple[float, ...]](maxlen=_STRIP)  # see `_note`
         self._states: dict[int, TuneState] = {}  # of the tuner, by number of the set
         self._job: Future[Any] | None = None  # what is computed, of the last that was asked for
-        self._moved = False  # something that is not in the line that repeats the page
-        server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
-        server.gui.main_panel.dock_right()
+        self._at, self._drawn = dict(setup.at), {}  # values of `NUMBERS`, world and seed, if moved
         self._status = server.gui.add_markdown("")
         self._add_walk()
         self._add_errors()
@@ -123,21 +122,22 @@ class LivePage:
 
     def _line(self, files: Sequence[str]) -> str:
         """Return how a client repeats this page with files, in Markdown."""
-        line = self._setup.line(files, self._setup.world, self._setup.seed)
-        more = " Velocities and numbers of the plant are not in it." * self._moved
-        return f"Saved. This repeats it:{more}\n\n```\n{line}\n```"
+        at = tuple(f"{name}={value}" for name, value in self._at.items())
+        line = self._setup.line(weights=tuple(files), at=at, **self._drawn)
+        return f"Saved. This repeats it:\n\n```\n{line}\n```"
 
     # The panel
 
+    def _add_sliders(self, start: Mapping[str, float], do: Callable[..., None]) -> dict[str, Any]:
+        """Add sliders of `NUMBERS` by their values at the start, which call `do` when moved."""
+        add, at = (
+            self._server.gui.add_slider,
+            {name: self._at.get(name, start[name]) for name in start},
+        )
+        return {name: self._when(add(*NUMBERS[name], value), do) for name, value in at.items()}
+
     def _add_walk(self) -> None:
         gui, when, send = self._server.gui, self._when, self._send
-        with gui.add_folder("Walk"):
-            run = gui.add_button("Stop")
-            when(gui.add_button("Reset: stand at the start again"), lambda _: send("reset"))
-            speed = gui.add_slider("speed [real time]", 0.1, 2.0, 0.1, 1.0)
-            velocity = [gui.add_slider(n, -most, most, 0.05, at) for n, most, at in _VELOCITY]
-            newtons = gui.add_slider("push [N]", 10.0, 400.0, 10.0, 60.0)
-            sides = gui.add_button_group(f"push {PUSH_TIME:g} s", list(_SIDES))
 
         def pace(_: Any) -> None:
             send("set_speed", speed.value * (run.label == "Stop"))
@@ -147,14 +147,19 @@ class LivePage:
             pace(None)
 
         def command(_: Any) -> None:
-            send("set_velocity", *(slider.value for slider in velocity))
-            self._moved = True
+            self._at |= {name: slider.value for name, slider in velocity.items()}
+            send("set_velocity", *(self._at[name] for name in _COMMAND))
 
-        when(run, stop)
-        when(speed, pace)
-        when(sides, lambda side: send("push", newtons.value * np.array(_SIDES[side])))
-        for slider in velocity:
-            when(slider, command)
+        with gui.add_folder("Walk"):
+            run = when(gui.add_button("Stop"), stop)
+            when(gui.add_button("Reset: stand at the start again"), lambda _: send("reset"))
+            speed = when(gui.add_slider("speed [real time]", 0.1, 2.0, 0.1, 1.0), pace)
+            velocity = self._add_sliders(_COMMAND, command)
+            newtons = gui.add_slider("push [N]", 10.0, 400.0, 10.0, 60.0)
+            sides = gui.add_button_group(f"push {PUSH_TIME:g} s", list(_SIDES))
+            when(sides, lambda side: send("push", newtons.value * np.array(_SIDES[side])))
+        if self._at.keys() & velocity:
+            command(None)
 
     def _add_errors(self) -> None:
         gui = self._server.gui
@@ -179,36 +184,29 @@ class LivePage:
 
     def _add_plant(self) -> None:
         gui, setup, send = self._server.gui, self._setup, self._send
-        with gui.add_folder("Plant", expand_by_default=False):
-            world = gui.add_dropdown("world", WORLDS, initial_value=setup.world)
-            seed = gui.add_number("seed", setup.seed, min=0, step=1)
-            numbers = {
-                name: (gui.add_slider(label, low, high, step, low), units)
-                for name, (label, low, high, step, units) in _NUMBERS.items()
-            }
-            payload = gui.add_slider("payload on the trunk [kg]", 0.0, 10.0, 0.1, 0.0)
-
-        def show() -> None:
-            self._setup = setup._replace(world=world.value, seed=int(seed.value))
-            self._plant = named_world(world.value, self._setup.seed, setup.robot.description)
-            for name, (slider, units) in numbers.items():
-                slider.value = units * float(getattr(self._plant, name))
+        self._plant = named_world(setup.world, setup.seed, setup.robot.description)
+        of_world = {name: float(getattr(self._plant, name)) for name in _PLANT}
 
         def draw(_: Any) -> None:
-            show()
-            send("set_world", self._plant, self._setup.seed)
+            self._drawn = {"world": world.value, "seed": int(seed.value)}
+            self._plant = named_world(world.value, int(seed.value), setup.robot.description)
+            for name in _PLANT:
+                self._at.pop(name, None)
+                numbers[name].value = float(getattr(self._plant, name))
+            send("set_world", self._plant, int(seed.value))
 
         def change(_: Any) -> None:
-            values = {name: np.asarray(x.value / units) for name, (x, units) in numbers.items()}
-            self._plant = self._plant._replace(**values)
-            send("set_numbers", self._plant, payload.value)
-            self._moved = True
+            self._at |= {name: slider.value for name, slider in numbers.items()}
+            self._plant = self._plant._replace(**{n: np.asarray(self._at[n]) for n in _PLANT})
+            send("set_numbers", self._plant, self._at["payload"])
 
-        show()
-        for handle in (world, seed):
-            self._when(handle, draw)
-        for handle in (*(slider for slider, _ in numbers.values()), payload):
-            self._when(handle, change)
+        with gui.add_folder("Plant", expand_by_default=False):
+            worlds = gui.add_dropdown("world", WORLDS, initial_value=setup.world)
+            world = self._when(worlds, draw)
+            seed = self._when(gui.add_number("seed", setup.seed, min=0, step=1), draw)
+            numbers = self._add_sliders(of_world | {"payload": 0.0}, change)
+        if self._at.keys() & numbers:
+            change(None)
 
     # Tuning
 
@@ -232,7 +230,7 @@ class LivePage:
         scene, robot = self._server.scene, self._setup.robot
         height, feet = float(robot.standing_height), range(len(robot.foot_point))
         model, edges = compile_model(robot.description), np.zeros((8, 2, 3), np.float32)
-        place_camera(self._server, height)
+        lay_out(self._server, height)
         (self._world, self._floor), self._handles = add_floor(scene), []
         for i, (name, colour) in enumerate(zip(self._names, rgb_of(self._names), strict=True)):
             root, across = f"/world/{i}", DISTANCE * height * ((len(self._names) - 1) / 2 - i)
@@ -278,16 +276,14 @@ class LivePage:
         weight = float(robot.mass * robot.gravity[2])
         scale = WEIGHT * float(robot.standing_height) / weight
         cone = _cone_edges(float(self._plant.floor_friction))
-        kinds = {
-            "planned": (now.planned, lambda force: np.stack([0.0 * force, force])[None]),
-            "measured": (now.measured, lambda force: np.stack([0.0 * force, force])[None]),
-            "cones": (now.measured, lambda force: force[2] * cone),
-        }
-        for kind, (forces, points) in kinds.items():
-            for handle, foot, force in zip(handles[kind], now.feet, forces, strict=True):
-                handle.position, handle.visible = foot, bool(force[2] > _LOADED * weight)
+        kinds = {"planned": now.planned, "measured": now.measured, "cones": now.measured}
+        for kind, forces in kinds.items():
+            for handle, foot, force in zip(handles[kind], now.feet, scale * forces, strict=True):
+                handle.position, handle.visible = foot, bool(force[2] > _LOADED * scale * weight)
                 if handle.visible:
-                    handle.points = points(scale * force).astype(np.float32)
+                    arrow = np.stack([np.zeros(3), force])[None]
+                    points = force[2] * cone if kind == "cones" else arrow
+                    handle.points = points.astype(np.float32)
         handles["bodies"].move(now.pose)
         handles["aim"].position = now.reference
 

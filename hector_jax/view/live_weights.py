@@ -24,13 +24,13 @@ from hector_jax.control.weights_file import save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.model import Robot
 
-_GROUPS = {  # names and units of the weights
-    "Orientation": ("Q_roll Q_pitch Q_yaw", "1/rad²"),
-    "Position": ("Q_x Q_y Q_z", "1/m²"),
-    "Turning rates": ("Q_wx Q_wy Q_wz", "s²/rad²"),
-    "Velocity": ("Q_vx Q_vy Q_vz", "s²/m²"),
-    "Forces of the feet": ("R_Fx R_Fy R_Fz", "1/N²"),
-    "Moments of the feet": ("R_Mx R_My R_Mz", "1/(N m)²"),
+_GROUPS = {  # of three weights, in their order, with their unit
+    "Orientation": "1/rad²",
+    "Position": "1/m²",
+    "Turning rates": "s²/rad²",
+    "Velocity": "s²/m²",
+    "Forces of the feet": "1/N²",
+    "Moments of the feet": "1/(N m)²",  # not of point feet
 }
 _STEP = 0.02  # of a slider, in decades
 
@@ -44,7 +44,8 @@ class PageSetup(NamedTuple):
     named: dict[str, Weights]  # sets that a button takes
     world: str  # of WORLDS
     seed: int  # of the plant
-    line: Callable[[Sequence[str], str, int], str]  # that repeats files, world and seed
+    at: dict[str, float]  # numbers of command and plant that are not the usual or the world's
+    line: Callable[..., str]  # that repeats the page, from its flags
 
 
 class WeightsPanel:
@@ -61,10 +62,7 @@ class WeightsPanel:
         """Add it to viser's panel.
 
         Args:
-            gui: of the server.
-            when: lets a function be called with what a client chose of a handle.
-            setup: of the page.
-            send: calls a method of the process of the walk.
+            gui, when, setup, send: of the page, see `LivePage`.
             line: returns what is shown of saved files.
         """
         self._send, self._repeat = send, line
@@ -78,8 +76,9 @@ class WeightsPanel:
             take = gui.add_button_group("as", list(setup.named))
             when(take, lambda name: self.set(self.chosen, setup.named[name]))
             when(gui.add_button("Undo"), lambda _: self._undo())
-            for title in _GROUPS:
-                self._add_group(gui, when, title)
+            names = np.reshape(direction_names(self._past[0][0]), (-1, 3)).tolist()
+            for group, members in zip(_GROUPS.items(), names, strict=False):
+                self._add_group(gui, when, *group, members)
             self._file = gui.add_text("file", "live.json")
             when(gui.add_button("Save these weights"), lambda _: self._save())
             self._line = gui.add_markdown("")
@@ -96,11 +95,9 @@ class WeightsPanel:
         self._send("set_weights", i, weights)
         self._show()
 
-    def _add_group(self, gui: Any, when: Callable[..., Any], title: str) -> None:
-        (members, unit), like = _GROUPS[title], self._past[0][0]
-        names = [name for name in members.split() if name in direction_names(like)]
-        if not names:
-            return  # point feet have no moments
+    def _add_group(
+        self, gui: Any, when: Callable[..., Any], title: str, unit: str, names: Sequence[str]
+    ) -> None:
         box = parameters.Q if names[0].startswith("Q") else parameters.R
         low, high = np.log10([box.lower, box.upper]).round(9).tolist()
         marks = tuple((d, f"{10.0**d:g}") for d in np.arange(low, high + 1.0, 2.0).tolist())
@@ -131,19 +128,18 @@ class WeightsPanel:
     def _save(self) -> None:
         """Write the set to a file of this folder, where alone a client of the page can write."""
         name = self._file.value
-        if not re.fullmatch(r"\w[\w.-]*\.json", name):
-            self._line.content = "A file is named `NAME.json`, without a folder."
-        elif name not in self._saved and Path(name).exists():
-            self._line.content = f"`{name}` exists: choose another name."
-        else:
-            try:
-                save_weights(Path(name), self._past[self.chosen][-1])
-            except InputError as error:
-                self._line.content = str(error)
-                return
-            self._saved.add(name)
-            self._texts[self.chosen] = name
-            self._line.content = self._repeat(self._texts)
+        try:
+            if not re.fullmatch(r"\w[\w.-]*\.json", name):
+                raise InputError("A file is named `NAME.json`, without a folder.")
+            if name not in self._saved and Path(name).exists():
+                raise InputError(f"`{name}` exists: choose another name.")
+            save_weights(Path(name), self._past[self.chosen][-1])
+        except InputError as error:
+            self._line.content = str(error)
+            return
+        self._saved.add(name)
+        self._texts[self.chosen] = name
+        self._line.content = self._repeat(self._texts)
 
 
 def _values(weights: Weights) -> Float[np.ndarray, " n"]:

@@ -36,7 +36,7 @@ from hector_jax.view.page_parts import (
     add_arrows,
     add_floor,
     add_label,
-    place_camera,
+    lay_out,
     plot,
     series,
 )
@@ -223,8 +223,6 @@ class Page:
     def _build_panel(self, description: str) -> None:
         gui, first = self._server.gui, self._motions[0]
         times = first.times[: self._length]
-        gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
-        gui.main_panel.dock_right()
         gui.add_markdown(description)
         with gui.add_folder("Playback"):
             self._button = gui.add_button("Pause")
@@ -264,7 +262,7 @@ class Page:
         heading = np.arctan2(displacement[1], displacement[0])
         across = np.array([-np.sin(heading), np.cos(heading), 0.0])
         height = self._motions[0].height
-        place_camera(self._server, height, heading)
+        lay_out(self._server, height, heading)
         self._world, _ = add_floor(scene)
         self._handles = []
         for i in range(len(self._motions)):

@@ -25,8 +25,10 @@ def add_floor(scene: Any) -> tuple[Any, Any]:
     return world, scene.add_grid("/world/floor", 30.0, 30.0, **colours)
 
 
-def place_camera(server: Any, height: float, heading: float = 0.0) -> None:
-    """Look from behind on the right at robots of this height [m] that walk along `heading`."""
+def lay_out(server: Any, height: float, heading: float = 0.0) -> None:
+    """Lay out the page, which looks at robots of this height [m] that walk along `heading`."""
+    server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+    server.gui.main_panel.dock_right()
     server.scene.set_up_direction("+z")
     camera, side = server.initial_camera, heading - np.deg2rad(50.0)
     camera.look_at = (0.0, 0.0, 0.76 * height)
