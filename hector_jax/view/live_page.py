@@ -9,6 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future
+from functools import partial
 from itertools import count
 from multiprocessing.connection import Connection
 from queue import SimpleQueue
@@ -25,22 +26,13 @@ from hector_jax.sim.live import LATE, PUSH_TIME, WINDOW, Frame, Now, Walked
 from hector_jax.sim.world import MAX_DELAY, WORLDS, named_world
 from hector_jax.tuning.difftune import TuneState
 from hector_jax.tuning.live import Work, take_step, what_matters
+from hector_jax.view import page_parts as parts
 from hector_jax.view.live_weights import PageSetup, WeightsPanel
 from hector_jax.view.motion import INK
-from hector_jax.view.page_parts import (
-    DISTANCE,
-    WEIGHT,
-    Bodies,
-    add_arrows,
-    add_floor,
-    add_label,
-    lay_out,
-    plot,
-)
 
 _FRAME = 1.0 / 30.0  # [s]
 _PAUSE = 8  # frames between two of which the numbers are shown
-_STRIP = 300  # frames of the errors that are drawn
+_STRIP = 10.0  # [s] of the errors that are drawn
 _SLOW = 0.95  # share of the wanted speed below which the machine is too slow
 _LOADED = 0.05  # share of the weight on a foot that is worth showing
 _FORCES = {"planned": (25, 25, 30), "measured": (240, 120, 20)}  # colours of arrows
@@ -82,7 +74,7 @@ class LivePage:
         self._send = lambda name, *values: connection.send((name, values))
         self._calls: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._names, self._frames = list(setup.sets), count()
-        self._strip = deque[tuple[float, ...]](maxlen=_STRIP)  # see `_note`
+        self._strip = deque[tuple[float, ...]]()  # see `_note`
         self._states: dict[int, TuneState] = {}  # of the tuner, by number of the set
         self._job: Future[Any] | None = None  # what is computed, of the last that was asked for
         self._at, self._drawn = dict(setup.at), {}  # values of `NUMBERS`, world and seed, if moved
@@ -114,8 +106,7 @@ class LivePage:
 
         def by_client(event: Any) -> None:
             if event.client is not None:  # the page moves its sliders too
-                value = getattr(event.target, "value", None)
-                self._calls.put(lambda: do(value))
+                self._calls.put(partial(do, getattr(event.target, "value", None)))
 
         event(by_client)
         return handle
@@ -130,10 +121,8 @@ class LivePage:
 
     def _add_sliders(self, start: Mapping[str, float], do: Callable[..., None]) -> dict[str, Any]:
         """Add sliders of `NUMBERS` by their values at the start, which call `do` when moved."""
-        add, at = (
-            self._server.gui.add_slider,
-            {name: self._at.get(name, start[name]) for name in start},
-        )
+        add = self._server.gui.add_slider
+        at = {name: self._at.get(name, value) for name, value in start.items()}
         return {name: self._when(add(*NUMBERS[name], value), do) for name, value in at.items()}
 
     def _add_walk(self) -> None:
@@ -171,7 +160,7 @@ class LivePage:
             self._table = gui.add_markdown("")
             empty = {name: np.full(1, np.nan) for name in self._names}
             titles = "off its reference, in the plane [cm]", "roll and pitch together [degrees]"
-            self._plots = [plot(gui, title, "time [s]", np.zeros(1), empty) for title in titles]
+            self._plots = [parts.plot(gui, x, "time [s]", np.zeros(1), empty) for x in titles]
 
     def _add_tuning(self) -> None:
         gui, when = self._server.gui, self._when
@@ -230,24 +219,24 @@ class LivePage:
         scene, robot = self._server.scene, self._setup.robot
         height, feet = float(robot.standing_height), range(len(robot.foot_point))
         model, edges = compile_model(robot.description), np.zeros((8, 2, 3), np.float32)
-        lay_out(self._server, height)
-        (self._world, self._floor), self._handles = add_floor(scene), []
+        parts.lay_out(self._server, height)
+        distance = parts.DISTANCE * height
+        (self._world, self._floor), self._handles = parts.add_floor(scene), []
         for i, (name, colour) in enumerate(zip(self._names, rgb_of(self._names), strict=True)):
-            root, across = f"/world/{i}", DISTANCE * height * ((len(self._names) - 1) / 2 - i)
+            root, across = f"/world/{i}", distance * ((len(self._names) - 1) / 2 - i)
             scene.add_frame(root, show_axes=False, position=(0.0, across, 0.0))
             # a label that moves lags behind: the robots stay near it, while the world moves
-            add_label(scene, f"/name{i}", name).position = (0.0, across, 2.0 * height)
+            parts.add_label(scene, f"/name{i}", name).position = (0.0, across, 2.0 * height)
             # each foot has arrows and a cone, from the origin of their own frames
-            parts: dict[str, list[Any]] = {
-                kind: [add_arrows(scene, f"{root}/{kind}{foot}", shade, height) for foot in feet]
+            handles: dict[str, Any] = {
+                kind: [parts.add_arrows(scene, f"{root}/{kind}{f}", shade, height) for f in feet]
                 for kind, shade in _FORCES.items()
             }
             add, shade = scene.add_line_segments, _FORCES["measured"]
-            parts["cones"] = [add(f"{root}/cone{f}", edges, shade, thickness=0.004) for f in feet]
-            aim = scene.add_icosphere(f"{root}/aim", 0.018, INK)
-            self._handles.append(
-                {"bodies": Bodies(scene, root, model, colour), "aim": aim, **parts}
-            )
+            handles["cones"] = [add(f"{root}/cone{f}", edges, shade, thickness=0.004) for f in feet]
+            handles["bodies"] = parts.Bodies(scene, root, model, colour)
+            handles["aim"] = scene.add_icosphere(f"{root}/aim", 0.018, INK)
+            self._handles.append(handles)
 
     def show(self, frame: Frame) -> None:
         """Show a frame; numbers and errors over time in some of them."""
@@ -270,11 +259,13 @@ class LivePage:
         # before the path begins there is no error, and with a NaN the page draws no line at all
         elif row[0] > last and np.isfinite(row).all():
             self._strip.append(row)
+            while self._strip[0][0] < row[0] - _STRIP:
+                self._strip.popleft()
 
     def _draw(self, now: Now, handles: dict[str, Any]) -> None:
         robot = self._setup.robot
         weight = float(robot.mass * robot.gravity[2])
-        scale = WEIGHT * float(robot.standing_height) / weight
+        scale = parts.WEIGHT * float(robot.standing_height) / weight
         cone = _cone_edges(float(self._plant.floor_friction))
         kinds = {"planned": now.planned, "measured": now.measured, "cones": now.measured}
         for kind, forces in kinds.items():

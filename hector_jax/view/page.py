@@ -28,18 +28,8 @@ from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.report.plots.style import rgb_of
 from hector_jax.report.report import render
 from hector_jax.store.run import METRICS, Run, loss_curves, progress_sentence
+from hector_jax.view import page_parts as parts
 from hector_jax.view.motion import INK, Motion
-from hector_jax.view.page_parts import (
-    DISTANCE,
-    WEIGHT,
-    Bodies,
-    add_arrows,
-    add_floor,
-    add_label,
-    lay_out,
-    plot,
-    series,
-)
 
 _RATE = 30.0  # displayed ticks per second, at most
 _PAUSE = 1.0  # [s] between readings of the metrics
@@ -80,7 +70,7 @@ def arrows(motion: Motion, kind: str, source: str) -> Float[np.ndarray, "T feet 
         kind: force or moment.
         source: commanded, measured or predicted.
     """
-    scale = WEIGHT * motion.height / motion.weight
+    scale = parts.WEIGHT * motion.height / motion.weight
     scale /= {"force": 1.0, "moment": _LEVER * motion.height}[kind]
     left = motion.R_yaw[:, :, 1]
     pairs = motion.feet.shape[1] // 2
@@ -231,21 +221,21 @@ class Page:
             self._follow = gui.add_checkbox("follow the robots", True)
         with gui.add_folder("Ground on the feet"):
             sources = {source: _SOURCES[source] for source in first.wrenches}
-            drawn = {"weight": first.weight, "length": 100.0 * WEIGHT * first.height}
+            drawn = {"weight": first.weight, "length": 100.0 * parts.WEIGHT * first.height}
             drawn |= {"sources": sources.values(), "moment": _LEVER * first.height * first.weight}
             gui.add_html(render("legend.html.j2", **drawn))
             labels = {name: source.words for name, source in sources.items()}
             labels |= {"force": "forces", "moment": "moments"}
             self._boxes = {n: gui.add_checkbox(text, n != "moment") for n, text in labels.items()}
         with gui.add_folder("Tuning"):
-            self._losses = plot(
+            self._losses = parts.plot(
                 gui, "loss on the model [% of the start]", "iteration", np.zeros(1), _NO_CURVES
             )
             self._progress = gui.add_markdown("")
         with gui.add_folder("Distance from the reference"):
             lines = [100.0 * motion.distance[: self._length] for motion in self._motions]
             errors = dict(zip(self._names, lines, strict=True))
-            plot(gui, "in the plane [cm]", "time [s]", times, errors)
+            parts.plot(gui, "in the plane [cm]", "time [s]", times, errors)
         self._button.on_click(lambda _: self._play(not self._playing))
         # pause when the user moves the slider, which `advance` also moves
         self._time.on_update(lambda event: event.client is not None and self._play(False))
@@ -262,11 +252,11 @@ class Page:
         heading = np.arctan2(displacement[1], displacement[0])
         across = np.array([-np.sin(heading), np.cos(heading), 0.0])
         height = self._motions[0].height
-        lay_out(self._server, height, heading)
-        self._world, _ = add_floor(scene)
+        parts.lay_out(self._server, height, heading)
+        self._world, _ = parts.add_floor(scene)
         self._handles = []
         for i in range(len(self._motions)):
-            position = (0.5 - i) * DISTANCE * height * across
+            position = (0.5 - i) * parts.DISTANCE * height * across
             scene.add_frame(f"/world/{i}", show_axes=False, position=position)
             self._handles.append(self._add_walk(i))
 
@@ -284,8 +274,8 @@ class Page:
             scene.add_line_segments(f"{root}/{line}", points, shade, thickness=thickness)
         return {
             "aim": scene.add_icosphere(f"{root}/aim", 0.018, INK),
-            "name": add_label(scene, f"{root}/name", ""),
-            "bodies": Bodies(scene, root, self._model, colour),
+            "name": parts.add_label(scene, f"{root}/name", ""),
+            "bodies": parts.Bodies(scene, root, self._model, colour),
             "arrows": {
                 (kind, source): (self._add_arrows(root, kind, source), arrows(motion, kind, source))
                 for source in motion.wrenches
@@ -295,7 +285,8 @@ class Page:
 
     def _add_arrows(self, root: str, kind: str, source: str) -> Any:
         name, height = f"{root}/{kind}/{source}", self._motions[0].height
-        return add_arrows(self._server.scene, name, _SOURCES[source].colour, height, _RADII[kind])
+        scene, colour = self._server.scene, _SOURCES[source].colour
+        return parts.add_arrows(scene, name, colour, height, _RADII[kind])
 
     def _draw(self, tick: int) -> None:
         aim = self._motions[0].reference[tick] * [1.0, 1.0, 0.0]
@@ -325,7 +316,7 @@ class Page:
         lines = loss_curves(histories) or _NO_CURVES
         iterations = np.arange(float(len(next(iter(lines.values())))))
         with self._server.atomic():
-            self._losses.series = series("iteration", lines)
+            self._losses.series = parts.series("iteration", lines)
             self._losses.data = (iterations, *lines.values())
             self._progress.content = progress_sentence(histories, done)
 
