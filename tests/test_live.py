@@ -202,6 +202,7 @@ def test_a_page_shows_what_the_walk_is_at_and_turns_undoes_and_saves_weights(mon
         slider = page._weights._sliders["Q_pitch"][0]
         assert slider.label == "Q_pitch = 50 1/rad²"
         page._weights._turn("Q_pitch", 2.0)
+        page._weights._turn("Q_pitch", 2.0)  # told twice, undone once
         assert slider.label == "Q_pitch = 100 1/rad²"
         assert found.walks[0].job.weights.Q.euler[1] == pytest.approx(100.0)
         page._weights._save()

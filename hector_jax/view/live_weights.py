@@ -118,7 +118,8 @@ class WeightsPanel:
         weights = self._past[self.chosen][-1]
         at = np.array(direction_names(weights)) == name
         steps = np.where(at, np.log(10.0**log / _values(weights)), 0.0)
-        self.set(self.chosen, jax.tree.map(np.asarray, scale_weights(weights, steps)))
+        if np.abs(steps).max() > 1e-9:  # a browser may tell a value twice, Undo shall not need two
+            self.set(self.chosen, jax.tree.map(np.asarray, scale_weights(weights, steps)))
 
     def _undo(self) -> None:
         if len(past := self._past[self.chosen]) > 1:
