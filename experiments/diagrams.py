@@ -3,11 +3,12 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Polygon, Rectangle
+from matplotlib.patches import Arc, Circle, FancyArrowPatch, FancyBboxPatch, Polygon, Rectangle
 
 from hector_jax import expert, load_robot, nominal, walk_config
 from hector_jax.control.weights import direction_names, directions, weights_to_vector
@@ -32,14 +33,15 @@ CHOICES = (  # what somebody has, and the commands to type
         "a controller",
         "an MPC in any language",
         (
-            "hector log check log.npz --robot mine.toml",
-            "hector tune --walker mine.py --planner plans.py --robot mine.toml",
+            "hector log check log.npz --robot mine/robot.toml",
+            "hector tune --walker mine.py --planner plans.py --robot mine/robot.toml"
+            " --start mine.json --walks 40",
         ),
     ),
     ("time for more walks", "in the simulator", ("hector tune --traj all --walks 300",)),
     (
-        "a robot that walks",
-        "and logs its walks",
+        "a real robot",
+        "that logs its walks",
         ("hector propose runs/robot --traj s", "hector log add runs/robot s.npz"),
     ),
 )
@@ -52,13 +54,13 @@ WORLDS = (  # height of a row, simulated robots, and who reads them
     ),
     (
         5.65,
-        "plants drawn near hfs\nother masses, friction, motors",
+        "no name: plants near hfs\nother masses, friction, motors",
         "network\nlearns what the ground returns",
     ),
     (4.45, "srbm\nrigid body with the network, in JAX", "tuner\nfollows its gradient"),
     (
         3.4,
-        "plants drawn farther from hfs\nand a noisy state estimate",
+        "no name: plants farther from hfs\nand a noisy state estimate",
         "best\nwalks there in its last steps",
     ),
     (
@@ -152,7 +154,7 @@ def draw_method(path: Path) -> None:
 def draw_own(path: Path) -> None:
     """Draw what the user of a controller provides, what is done with it, and the first minutes."""
     with _canvas(path, -0.1, 5.75) as axes:
-        for x, text, color in ((2.1, "you provide", INK), (8.5, "hector_jax does", BLUE)):
+        for x, text, color in ((2.3, "you provide", INK), (8.5, "hector_jax does", BLUE)):
             axes.text(x, 5.55, text, weight="bold", fontsize=12, ha="center", color=color)
         rows = (
             (4.85, "walker\nweights, command in; log out", "is it the weights?\nhector log check"),
@@ -167,12 +169,13 @@ def draw_own(path: Path) -> None:
                 "walks and slopes\nhector tune --walker",
             ),
         )
-        for y, given, done in rows:
-            _box(axes, (2.1, y), (4.0, 0.85), given, facecolor="white")
+        for (y, given, done), words in zip(rows, ("log.npz, a bag", "plans", "files"), strict=True):
+            _box(axes, (2.3, y), (3.7, 0.85), given, facecolor="white")
             _box(axes, (8.5, y), (3.6, 0.85), done, edgecolor=BLUE)
-            _arrow(axes, (4.1, y), (6.7, y))
-        axes.text(5.4, 5.05, "log.npz, a bag", fontsize=9.5, ha="center")
-        axes.text(5.4, 4.0, "plans", fontsize=9.5, ha="center")
+            _arrow(axes, (4.15, y), (6.7, y), text=words, at=(5.4, y + 0.22))
+        back = (8.5, 2.32), (8.5, 1.98), (0.15, 1.98), (0.15, 4.85), (0.45, 4.85)
+        _arrow(axes, *back, text="walk, and plan, with other weights", at=(5.4, 2.16), color=BLUE)
+        _arrow(axes, (0.15, 3.8), (0.45, 3.8), color=BLUE)
         words = "best.json, your format"
         _arrow(axes, (10.3, 2.75), (11.6, 2.75), color=BLUE, linewidth=2.6)
         axes.text(10.95, 2.1, words, fontsize=9.5, ha="center", color=BLUE)
@@ -221,14 +224,16 @@ def draw_commands(path: Path) -> None:
         _box(axes, (0.65, 3.35), (1.2, 0.6), "You have", facecolor="white")
         axes.plot([1.25, 1.55], [3.35, 3.35], color=INK, linewidth=1.6)
         axes.plot([1.55, 1.55], places[[0, -1]], color=INK, linewidth=1.6)
-        for y, (title, line, commands) in zip(places, CHOICES, strict=True):
+        for y, (title, words, commands) in zip(places, CHOICES, strict=True):
             _arrow(axes, (1.55, y), (1.95, y))
-            _box(axes, (3.4, y), (2.9, 0.85), f"{title}\n{line}")
+            _box(axes, (3.4, y), (2.9, 0.85), f"{title}\n{words}")
             _arrow(axes, (4.85, y), (5.3, y), color=BLUE)
-            for i, command in enumerate(commands):
-                at = y + 0.17 * (len(commands) - 1) - 0.34 * i
+            break_at: dict[str, Any] = {"subsequent_indent": "  ", "break_on_hyphens": False}
+            lines = [line for command in commands for line in wrap(command, 54, **break_at)]
+            for i, line in enumerate(lines):
+                at = y + 0.15 * (len(lines) - 1) - 0.3 * i
                 look = {"family": "monospace", "va": "center", "color": BLUE}
-                axes.text(5.45, at, command, fontsize=9.5, **look)
+                axes.text(5.45, at, line, fontsize=9.5, **look)
 
 
 def draw_time(path: Path) -> None:
@@ -289,7 +294,7 @@ def _draw_side(
     """Draw a foot from the side, its foot point at a place, 30 units a metre."""
     x, y = point
     skin: dict[str, Any] = {"facecolor": "#dfe4ec", "edgecolor": INK}
-    axes.text(0.1, 6.0, "seen from the right", weight="bold", fontsize=11)
+    axes.text(0.1, 6.0, "HECTOR's foot, seen from the right", weight="bold", fontsize=11)
     axes.plot([0.2, 7.0], [y, y], color="0.6", linewidth=1.2)
     shin = [-0.2, ankle], [-0.5, 2.6], [0.1, 2.6], [0.2, ankle]
     sole = [-heel, 0.15], [toe, 0.15], [toe, 0.5], [0.4, ankle + 0.25], [-0.4, ankle + 0.25]
@@ -337,7 +342,8 @@ def _draw_above(axes: Axes, point: tuple[float, float], toe: float, heel: float)
         at = tip + 0.4 * across - 0.25 * along
         _arrow(axes, point, tuple(tip), text=f"{name}, foot", at=at, color=BLUE, linewidth=2.2)
     axes.plot(x, y, "o", color=BLUE, markersize=8)
-    axes.text(x + 1.5, y + 0.35, "yaw", **CENTRE, **SMALL)
+    axes.add_patch(Arc(point, 2.2, 2.2, theta2=np.rad2deg(yaw), color=INK, linewidth=1.2))
+    axes.text(x + 1.4, y + 0.37, "yaw", **CENTRE, **SMALL)
     rows = (
         ("In the MPC", "F has the axes of the world, and M those of the foot."),
         ("In logs, plans and exports", "Both have the axes of the world."),

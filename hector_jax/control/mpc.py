@@ -414,24 +414,32 @@ the solution has no derivative.
 """
 
 
-@partial(solve_mpc_by_rows.defjvp, symbolic_zeros=True)
-def _jvp_by_rows(
-    config: MpcConfig, dt: float, max_contacts: int, primals: tuple, tangents: tuple
-) -> tuple:
-    (problem,), (moved,) = primals, tangents
+@partial(jax.jit, static_argnums=(0, 2, 3))  # a program that differentiates it often traces it once
+def _rows_of_wrench(
+    config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: int
+) -> tuple[tuple[Wrench, Solution], Array, MpcProblem]:
+    """Return `solve_mpc`, the feet of its contacts, and the derivative of their wrenches."""
     solve = partial(solve_mpc, config, dt=dt, max_contacts=max_contacts)
     wrench, pull_back, solution = jax.vjp(solve, problem, has_aux=True)
     horizon = problem.horizon
     inputs = horizon.contact if horizon.inputs is None else horizon.inputs
-    selection = feet_of_contacts(inputs[0].astype(wrench.force.dtype), max_contacts)
-    one = jnp.eye(6, dtype=selection.dtype)
-    each = jnp.einsum("cf,ij->cifj", selection, one).reshape(-1, *selection.shape[1:], 6)
-    (by_problem,) = jax.vmap(pull_back)(Wrench(each[..., :3], each[..., 3:]))
+    feet = feet_of_contacts(inputs[0].astype(wrench.force.dtype), max_contacts)
+    each = jnp.einsum("cf,ij->cifj", feet, jnp.eye(6, dtype=feet.dtype))
+    each = each.reshape(-1, *feet.shape[1:], 6)
+    (rows,) = jax.vmap(pull_back)(Wrench(each[..., :3], each[..., 3:]))
+    return (wrench, solution), feet, rows
+
+
+@partial(solve_mpc_by_rows.defjvp, symbolic_zeros=True)
+def _jvp_by_rows(
+    config: MpcConfig, dt: float, max_contacts: int, primals: tuple, tangents: tuple
+) -> tuple:
+    found, feet, rows = _rows_of_wrench(config, *primals, dt, max_contacts)
     changes = [
-        jnp.tensordot(rows, change, jnp.ndim(change))
-        for rows, change in zip(*map(jax.tree.leaves, (by_problem, moved)), strict=True)
+        jnp.tensordot(row, change, jnp.ndim(change))
+        for row, change in zip(*map(jax.tree.leaves, (rows, *tangents)), strict=True)
         if not isinstance(change, SymbolicZero)
     ]
-    planned = selection.T @ sum(changes).reshape(-1, 6)
-    still = jax.tree.map(zero_from_primal, solution)
-    return (wrench, solution), (Wrench(planned[:, :3], planned[:, 3:]), still)
+    moved = feet.T @ sum(changes).reshape(-1, 6)
+    still = jax.tree.map(zero_from_primal, found[1])
+    return found, (Wrench(moved[:, :3], moved[:, 3:]), still)

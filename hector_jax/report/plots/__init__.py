@@ -170,7 +170,7 @@ def save_weight_bars(
         style.log_axis(axes, "y")
         labels = {"rotation": 60, "ha": "right", "va": "center", "rotation_mode": "anchor"}
         style.category_axis(axes, [name.replace("_", " ") for name in names], 3, **labels)
-        axes.set_ylabel("weight / nominal")
+        axes.set_ylabel("weight / nominal, log scale")
     return caption("weights")
 
 
