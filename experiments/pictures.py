@@ -57,13 +57,12 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import check
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.report.plots.style import drawing, label_of, looks_of
-from hector_jax.robot.model import Robot, compile_model
+from hector_jax.robot.model import Robot
+from hector_jax.sim.live import Call, Session
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections
 from hector_jax.verdict.foretell import HERE, calibrated
-from hector_jax.view.live import Call, Frame, Session
 from hector_jax.view.live_page import LivePage
-from hector_jax.view.live_tuning import Tuner
 from hector_jax.view.live_weights import PageSetup
 from hector_jax.view.motion import motions
 from hector_jax.view.page import opened_server
@@ -257,10 +256,9 @@ def _live_page(
     session = Session(robot, [Job(weights, command, plant) for weights in sets.values()])
     session.warm_up()
     named = {"nominal": nominal(), "expert": expert(), "shipped": shipped()}
-    model, line = compile_model(robot.description), lambda *_: ""
-    setup = PageSetup(robot, model, sets, list(sets), named, "hfs", 0, line)
+    setup = PageSetup(robot, sets, list(sets), named, "hfs", 0, {}, str)
     with opened_server("127.0.0.1", 8765) as (server, address):
-        page = LivePage(server, setup, _Direct(session), Tuner(None, robot))  # pyright: ignore
+        page = LivePage(server, setup, _Direct(session), None)  # pyright: ignore
 
         def go(seconds: float) -> None:
             ticks, spent = round(seconds / session.config.gait.tick), 0.0
@@ -271,7 +269,7 @@ def _live_page(
                 spent += time.process_time() - start
                 if k % _TICKS == _TICKS - 1 or k == ticks - 1:
                     factor = min(seconds * (k + 1) / ticks / spent, 1.0)
-                    page.show(Frame(*session.frame(), factor, wanted=1.0, compilations=0))
+                    page.show(session.frame()._replace(factor=factor))
             time.sleep(1.0)  # until it is drawn
 
         with tempfile.TemporaryDirectory() as profile, opened(address, profile, height) as tab:

@@ -19,11 +19,10 @@ from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal, weights_to_vector
 from hector_jax.control.weights_file import load_weights, shipped, weights_tree
-from hector_jax.robot.model import compile_model
+from hector_jax.sim.live import Session
 from hector_jax.sim.world import hfs, hfs_even
-from hector_jax.view.live import Frame, Session, count_compilations
+from hector_jax.tuning.live import take_step, what_matters
 from hector_jax.view.live_page import LivePage
-from hector_jax.view.live_tuning import Tuner, take_step, what_matters
 from hector_jax.view.live_weights import PageSetup
 from hector_jax.view.page import opened_server
 
@@ -40,6 +39,17 @@ def session():
     found = Session(ROBOT, [job(shipped(ROBOT))])
     go(found, 4.0)
     return found
+
+
+def count_compilations():
+    """A function that tells how many programs this process has compiled or loaded since."""
+    found = []
+
+    def listen(event, duration_secs, **_):
+        found.extend([event] * (event == "/jax/core/compile/backend_compile_duration"))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    return lambda: len(found)
 
 
 def go(session, seconds):
@@ -67,7 +77,7 @@ def test_nothing_compiles_while_a_person_turns_and_both_sets_walk_on_one_plant()
     go(found, 0.3)
     found.set_weights(0, expert(ROBOT))
     found.set_velocity(0.3, 0.1, 0.2)
-    found.set_plant(PLANT._replace(mass=np.asarray(1.05), delay=np.asarray(0.003)), 1.0)
+    found.set_numbers(PLANT._replace(mass=np.asarray(1.05), delay=np.asarray(0.003)), 1.0)
     found.push(np.array([0.0, 30.0, 0.0]))
     go(found, 0.8)
     found.reset()
@@ -127,7 +137,7 @@ def test_one_step_of_the_tuner_moves_the_weights_of_the_walk_just_seen():
     now = go(found, 9.5)
     assert np.linalg.norm(now.errors[:2]) < np.linalg.norm(before[:2])
     assert int(take_step(ROBOT, state, found.log(0))[0].iteration) == 2
-    said = what_matters(ROBOT, walked).splitlines()[2:]
+    said = what_matters(ROBOT, None, walked)[2].splitlines()[2:]
     assert said
     assert all(re.match(r"- `[QR]_\w+`.*, doubled: \w+ [+-]\d+ %, ", line) for line in said)
 
@@ -140,6 +150,9 @@ def test_what_is_not_live_is_refused_in_a_line(monkeypatch, capsys, tmp_path):
         tmp_path, "--robot", EXAMPLES / "quadruped/robot.toml"
     )
     assert "--seconds is of a run" in line("--live", "--seconds", 2)
+    assert "--at mass must be a number from 0.7 to 1.3, got '9'" in line("--live", "--at", "mass=9")
+    assert "unknown number 'mas'; did you mean 'mass'?" in line("--live", "--at", "mas=1")
+    assert "--at is of a live walk: --live" in line(tmp_path, "--at", "mass=1")
     assert "it tunes; got standin" in line("--live", "--world", "standin")
     own = EXAMPLES / "own_controller" / "numbers.toml"
     assert "whose program is not walked live" in line("--live", "--robot", own)
@@ -164,15 +177,19 @@ def test_a_page_shows_what_the_walk_is_at_and_turns_undoes_and_saves_weights(mon
     monkeypatch.chdir(tmp_path)
     found, named = Session(ROBOT, [job()]), {"nominal": nominal(ROBOT), "expert": expert(ROBOT)}
 
-    def line(files, world, seed):
-        return f"hector view --live --weights {' '.join(files)} --world {world} --seed {seed}"
+    def line(weights, at, world="hfs", seed=0):
+        line = f"hector view --live --weights {' '.join(weights)} --world {world} --seed {seed}"
+        return f"{line} --at {' '.join(at)}"
 
-    model, sets = compile_model(ROBOT.description), {"nominal": nominal(ROBOT)}
-    setup = PageSetup(ROBOT, model, sets, ["nominal"], named, "hfs", 0, line)
+    sets = {"nominal": nominal(ROBOT)}
+    at = {"ahead": 0.3, "mass": 1.1}
+    setup = PageSetup(ROBOT, sets, ["nominal"], named, "hfs", 0, at, line)
     go(found, 0.5)
     with opened_server("127.0.0.1", 0) as (server, _):
-        page = LivePage(server, setup, Wire(found), Tuner(HandsOver(), ROBOT))
-        page.show(Frame(*found.frame(), 0.4, 1.0, 0))
+        page = LivePage(server, setup, Wire(found), HandsOver())
+        assert found.walks[0].job.command.velocity.tolist() == [[0.3, 0.0]] * 2
+        assert float(found.walks[0].job.imperfections.mass) == 1.1
+        page.show(found.frame()._replace(factor=0.4))
         assert "0.40: **this machine is too slow** for speed 1" in page._status.content
         assert "**nominal**: 0.5 s; QP solved; " in page._status.content
         assert re.search(r"(left|right) \d+ N, \d+ % of friction", page._status.content)
@@ -185,24 +202,27 @@ def test_a_page_shows_what_the_walk_is_at_and_turns_undoes_and_saves_weights(mon
         slider = page._weights._sliders["Q_pitch"][0]
         assert slider.label == "Q_pitch = 50 1/rad²"
         page._weights._turn("Q_pitch", 2.0)
+        page._weights._turn("Q_pitch", 2.0)  # told twice, undone once
         assert slider.label == "Q_pitch = 100 1/rad²"
         assert found.walks[0].job.weights.Q.euler[1] == pytest.approx(100.0)
         page._weights._save()
         assert (
-            "hector view --live --weights live.json --world hfs --seed 0"
+            "hector view --live --weights live.json --world hfs --seed 0 --at ahead=0.3 mass=1.1 "
+            "aside=0.0 turn=0.0 floor_friction=0.8 delay=0.002 payload=0.0\n"
             in page._weights._line.content
         )
         saved = load_weights(tmp_path / "live.json", ROBOT)
         assert weights_tree(saved) == weights_tree(found.walks[0].job.weights)
-        page._weights._undo_last()
+        page._weights._undo()
         assert weights_tree(found.walks[0].job.weights) == weights_tree(nominal(ROBOT))
         page._weights._file.value = "../there.json"
         page._weights._save()
         assert not (tmp_path.parent / "there.json").exists()
-        page._reset()
-        page.show(Frame(*found.frame(), 1.0, 1.0, 0))  # before t = 0
-        assert not page._strips[0]
-        page._ask("step")
+        assert page._strip
+        found.reset()
+        page.show(found.frame())  # before t = 0
+        assert not page._strip
+        page._ask(take_step)
         page.tune(found.log(0))
         assert page._found.content.startswith("Not yet: ")
 

@@ -388,8 +388,8 @@ class View(Flags):
     run: tuple[Run, ...] = field(metadata={"or": "live"})
     live: bool = False  # instead: walk in real time, turn weights, push, tune step by step
     robot: RobotFile = None  # TOML file of the robot of a live walk; HECTOR by default
-    # weights of a live walk, one or two: nominal, expert, shipped or a weights file
-    weights: tuple[Weights, ...] = ("nominal",)
+    weights: tuple[Weights, ...] = ("nominal",)  # of a live walk, one or two: names or files
+    at: tuple[str, ...] = ()  # numbers of a live walk, as its page repeats them: ahead=0.3 mass=1.1
     # weight sets of the run: before and after; while it is tuned, `with` in place of `best`
     sets: tuple[str, str] = ("nominal", "best")
     world: World = "hfs"  # where both walk

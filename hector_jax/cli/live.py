@@ -1,26 +1,28 @@
 """`hector view --live`: a robot that walks on a page while its weights are turned."""
 
-import shlex
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from multiprocessing import Pipe
+from typing import Any
 
 import jax
 import numpy as np
 
 from hector_jax.cli import arguments
 from hector_jax.cli.flags import NAMED_WEIGHTS, View
+from hector_jax.cli.parse import as_command
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import Weights
 from hector_jax.core.console import Broken, say
-from hector_jax.core.inputs import InputError, require_package
+from hector_jax.core.inputs import InputError, require_package, unknown
 from hector_jax.core.pool import start_process, workers
-from hector_jax.robot.model import Robot, compile_model, load_robot
+from hector_jax.core.settings import Range
+from hector_jax.robot.model import Robot, load_robot
+from hector_jax.sim.live import simulate
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import WORLDS, named_world
-from hector_jax.view.live import simulate
-from hector_jax.view.live_page import serve_live
-from hector_jax.view.live_tuning import Tuner
+from hector_jax.view.live_page import NUMBERS, serve_live
 from hector_jax.view.live_weights import PageSetup
 from hector_jax.view.page import opened_server
 
@@ -40,7 +42,7 @@ def run_live(args: View) -> None:
     if len(args.weights) > 2:
         raise InputError(f"--weights of a live walk are one or two, got {len(args.weights)}")
     require_package("viser", "view", "the page")
-    robot = load_robot(args.robot)
+    robot = jax.tree.map(np.asarray, load_robot(args.robot))  # can be sent to a process
     if robot.description.numbers:
         text = "[numbers] are of a controller of your own, whose program is not walked live"
         raise InputError(f"{robot.description.path}: {text}")
@@ -50,26 +52,37 @@ def run_live(args: View) -> None:
     command = named_command("straight")
     jobs = [Job(weights, command, plant, seed=args.seed) for weights in sets.values()]
 
-    def line(files: Sequence[str], world: str, seed: int) -> str:
-        words = ["hector", "view", "--live", "--weights", *files]
-        words += ["--robot", str(args.robot)] if args.robot else []
-        return shlex.join([*words, "--world", world, "--seed", str(seed)])
+    def line(**flags: Any) -> str:
+        return as_command("hector view", replace(args, **flags))
 
-    model = compile_model(robot.description)
-    setup = PageSetup(
-        robot, model, sets, list(args.weights), _named(robot), args.world, args.seed, line
-    )
+    texts, named, at = list(args.weights), _named(robot), _numbers(args.at)
+    setup = PageSetup(robot, sets, texts, named, args.world, args.seed, at, line)
     here, there = Pipe()
     with workers(1) as pool, opened_server(args.host, args.port) as (server, address):
-        process = start_process(simulate, there, jax.tree.map(np.asarray, robot), jobs)
+        process = start_process(simulate, there, robot, jobs)
         there.close()
         say(f"open {address} in a browser; Ctrl-C ends it")
         try:
-            serve_live(server, setup, here, Tuner(pool, jax.tree.map(np.asarray, robot)))
+            serve_live(server, setup, here, pool)
         except (EOFError, ConnectionError):
             raise Broken("the process in which the robot walks has ended") from None
         finally:
             process.kill()
+
+
+def _numbers(texts: Sequence[str]) -> dict[str, float]:
+    """Read numbers of a live walk, NAME=VALUE each."""
+    found = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        if name not in NUMBERS:
+            raise InputError(f"--at {text}: {unknown('number', name, NUMBERS)}")
+        _, low, high, _ = NUMBERS[name]
+        with suppress(ValueError):
+            found[name] = float(value)
+        if name not in found or found[name] not in Range(low, high):
+            raise InputError(f"--at {name} must be a number {Range(low, high)}, got {value!r}")
+    return found
 
 
 def _named(robot: Robot) -> dict[str, Weights]:

@@ -273,7 +273,7 @@ def as_command(program: str, flags: Any) -> str:
     words = program.split()
     for field in fields(flags):
         value, flag = getattr(flags, field.name), field.name.replace("_", "-")
-        if value == field.default or field.name in _OF_THE_CALL:
+        if value in (field.default, ()) or field.name in _OF_THE_CALL:
             continue
         if isinstance(value, bool):
             words.append(f"--{'' if value else 'no-'}{flag}")

@@ -26,7 +26,7 @@ from hector_jax.view.video import check_film
 
 
 def _run_of(args: View) -> Path:
-    for name in ("robot", "weights"):
+    for name in ("robot", "weights", "at"):
         if args.is_given(name):
             raise InputError(f"--{name} is of a live walk: --live")
     if len(args.run) != 1:

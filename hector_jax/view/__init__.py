@@ -1,5 +1,5 @@
 """A walk to look at: films, and pages in the browser of a run or of a robot that walks live.
 
 `video` and `render` film, `page` shows a run, `live_page` a robot that walks in the process of
-`live`; `pictures` draws all that one command shows.
+`sim.live`; `pictures` draws all that one command shows.
 """

@@ -28,16 +28,13 @@ from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.report.plots.style import rgb_of
 from hector_jax.report.report import render
 from hector_jax.store.run import METRICS, Run, loss_curves, progress_sentence
+from hector_jax.view import page_parts as parts
 from hector_jax.view.motion import INK, Motion
-from hector_jax.view.page_parts import add_floor, body_meshes, plot, series
 
 _RATE = 30.0  # displayed ticks per second, at most
 _PAUSE = 1.0  # [s] between readings of the metrics
 # Lengths in the scene, as shares of the robot's standing height.
-_DISTANCE = 1.9  # between the two walks
-_WEIGHT = 5 / 6  # length of an arrow for the robot's weight
 _MIN_ARROW = 0.07  # shorter ones are not drawn
-_HEAD = 0.083  # of an arrow
 _RADII = {"force": 0.019, "moment": 0.033}  # of the shafts of arrows
 _LEVER = 0.24  # of the moment that is drawn as long as the weight: the weight at this lever
 _NO_CURVES = {"no iteration yet": np.full(1, np.nan)}  # viser refuses a plot without a line
@@ -73,7 +70,7 @@ def arrows(motion: Motion, kind: str, source: str) -> Float[np.ndarray, "T feet 
         kind: force or moment.
         source: commanded, measured or predicted.
     """
-    scale = _WEIGHT * motion.height / motion.weight
+    scale = parts.WEIGHT * motion.height / motion.weight
     scale /= {"force": 1.0, "moment": _LEVER * motion.height}[kind]
     left = motion.R_yaw[:, :, 1]
     pairs = motion.feet.shape[1] // 2
@@ -188,7 +185,7 @@ class Page:
     ) -> None:
         """Build the page on a `viser.ViserServer`; other arguments as in `serve`."""
         self._server, self._folder = server, folder
-        self._model, self._data = model, mujoco.MjData(model)
+        self._model = model
         self._names, self._motions = list(motions), list(motions.values())
         self._length = min(len(motion.times) for motion in self._motions)
         self._playing, self._tick = True, -1  # displayed tick; -1: draw again
@@ -216,8 +213,6 @@ class Page:
     def _build_panel(self, description: str) -> None:
         gui, first = self._server.gui, self._motions[0]
         times = first.times[: self._length]
-        gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
-        gui.main_panel.dock_right()
         gui.add_markdown(description)
         with gui.add_folder("Playback"):
             self._button = gui.add_button("Pause")
@@ -226,21 +221,21 @@ class Page:
             self._follow = gui.add_checkbox("follow the robots", True)
         with gui.add_folder("Ground on the feet"):
             sources = {source: _SOURCES[source] for source in first.wrenches}
-            drawn = {"weight": first.weight, "length": 100.0 * _WEIGHT * first.height}
+            drawn = {"weight": first.weight, "length": 100.0 * parts.WEIGHT * first.height}
             drawn |= {"sources": sources.values(), "moment": _LEVER * first.height * first.weight}
             gui.add_html(render("legend.html.j2", **drawn))
             labels = {name: source.words for name, source in sources.items()}
             labels |= {"force": "forces", "moment": "moments"}
             self._boxes = {n: gui.add_checkbox(text, n != "moment") for n, text in labels.items()}
         with gui.add_folder("Tuning"):
-            self._losses = plot(
+            self._losses = parts.plot(
                 gui, "loss on the model [% of the start]", "iteration", np.zeros(1), _NO_CURVES
             )
             self._progress = gui.add_markdown("")
         with gui.add_folder("Distance from the reference"):
             lines = [100.0 * motion.distance[: self._length] for motion in self._motions]
             errors = dict(zip(self._names, lines, strict=True))
-            plot(gui, "in the plane [cm]", "time [s]", times, errors)
+            parts.plot(gui, "in the plane [cm]", "time [s]", times, errors)
         self._button.on_click(lambda _: self._play(not self._playing))
         # pause when the user moves the slider, which `advance` also moves
         self._time.on_update(lambda event: event.client is not None and self._play(False))
@@ -252,19 +247,16 @@ class Page:
         self._button.label = "Pause" if playing else "Play"
 
     def _build_world(self) -> None:
-        scene, camera = self._server.scene, self._server.initial_camera
-        scene.set_up_direction("+z")
+        scene = self._server.scene
         displacement = self._motions[0].reference[-1] - self._motions[0].reference[0]
         heading = np.arctan2(displacement[1], displacement[0])
         across = np.array([-np.sin(heading), np.cos(heading), 0.0])
-        side = heading - np.deg2rad(50.0)
         height = self._motions[0].height
-        camera.look_at = (0.0, 0.0, 0.76 * height)
-        camera.position = tuple(height * np.array([3.8 * np.cos(side), 3.8 * np.sin(side), 1.8]))
-        self._world, _ = add_floor(scene)
+        parts.lay_out(self._server, height, heading)
+        self._world, _ = parts.add_floor(scene)
         self._handles = []
         for i in range(len(self._motions)):
-            position = (0.5 - i) * _DISTANCE * height * across
+            position = (0.5 - i) * parts.DISTANCE * height * across
             scene.add_frame(f"/world/{i}", show_axes=False, position=position)
             self._handles.append(self._add_walk(i))
 
@@ -280,14 +272,10 @@ class Page:
         for line, (segments, height, shade, thickness) in lines.items():
             points = segments * [1.0, 1.0, 0.0] + [0.0, 0.0, height]
             scene.add_line_segments(f"{root}/{line}", points, shade, thickness=thickness)
-        label = {"anchor": "bottom-center", "font_screen_scale": 1.4}
         return {
             "aim": scene.add_icosphere(f"{root}/aim", 0.018, INK),
-            "name": scene.add_label(f"{root}/name", "", **label),
-            "bodies": {
-                body: scene.add_mesh_trimesh(f"{root}/body{body}", mesh)
-                for body, mesh in body_meshes(self._model, colour).items()
-            },
+            "name": parts.add_label(scene, f"{root}/name", ""),
+            "bodies": parts.Bodies(scene, root, self._model, colour),
             "arrows": {
                 (kind, source): (self._add_arrows(root, kind, source), arrows(motion, kind, source))
                 for source in motion.wrenches
@@ -296,22 +284,15 @@ class Page:
         }
 
     def _add_arrows(self, root: str, kind: str, source: str) -> Any:
-        height = self._motions[0].height
-        radius = height * _RADII[kind]
-        size = {"shaft_radius": radius, "head_radius": 2.3 * radius, "head_length": _HEAD * height}
-        points, colour = np.zeros((1, 2, 3), np.float32), _SOURCES[source].colour
-        name = f"{root}/{kind}/{source}"
-        return self._server.scene.add_arrows(name, points, colour, **size)
+        name, height = f"{root}/{kind}/{source}", self._motions[0].height
+        scene, colour = self._server.scene, _SOURCES[source].colour
+        return parts.add_arrows(scene, name, colour, height, _RADII[kind])
 
     def _draw(self, tick: int) -> None:
         aim = self._motions[0].reference[tick] * [1.0, 1.0, 0.0]
         self._world.position = -aim * self._follow.value
         for name, motion, handles in zip(self._names, self._motions, self._handles, strict=True):
-            self._data.qpos[:] = motion.qpos[tick]
-            mujoco.mj_kinematics(self._model, self._data)
-            for body, handle in handles["bodies"].items():
-                handle.position = self._data.xpos[body].copy()
-                handle.wxyz = self._data.xquat[body].copy()
+            handles["bodies"].move(motion.qpos[tick])
             for (kind, source), (handle, ends) in handles["arrows"].items():
                 length = np.linalg.norm(ends[tick, :, 1] - ends[tick, :, 0], axis=1)
                 visible = length > _MIN_ARROW * motion.height  # false for NaN
@@ -335,7 +316,7 @@ class Page:
         lines = loss_curves(histories) or _NO_CURVES
         iterations = np.arange(float(len(next(iter(lines.values())))))
         with self._server.atomic():
-            self._losses.series = series("iteration", lines)
+            self._losses.series = parts.series("iteration", lines)
             self._losses.data = (iterations, *lines.values())
             self._progress.content = progress_sentence(histories, done)
 

@@ -5,10 +5,15 @@ from itertools import cycle
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.report.plots.style import rgb_of
 
+# Lengths in the scene, as shares of the robot's standing height.
+DISTANCE = 1.9  # between two robots
+WEIGHT = 5 / 6  # length of an arrow for the robot's weight
+_HEAD = 0.083  # of an arrow
 _DASHES = ([6, 4], [], [2, 3], [10, 3, 2, 3])  # of lines in plots: before, after, further sets
 
 
@@ -18,6 +23,30 @@ def add_floor(scene: Any) -> tuple[Any, Any]:
     colours = {"cell_color": (224, 228, 233), "section_color": (196, 203, 211)}
     colours |= {"plane_color": (241, 243, 246), "plane_opacity": 1.0}
     return world, scene.add_grid("/world/floor", 30.0, 30.0, **colours)
+
+
+def lay_out(server: Any, height: float, heading: float = 0.0) -> None:
+    """Lay out the page, which looks at robots of this height [m] that walk along `heading`."""
+    server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+    server.gui.main_panel.dock_right()
+    server.scene.set_up_direction("+z")
+    camera, side = server.initial_camera, heading - np.deg2rad(50.0)
+    camera.look_at = (0.0, 0.0, 0.76 * height)
+    camera.position = tuple(height * np.array([3.8 * np.cos(side), 3.8 * np.sin(side), 1.8]))
+
+
+def add_label(scene: Any, name: str, text: str) -> Any:
+    """Add a label that stands on its position."""
+    return scene.add_label(name, text, anchor="bottom-center", font_screen_scale=1.4)
+
+
+def add_arrows(
+    scene: Any, name: str, colour: tuple[int, int, int], height: float, radius: float = 0.019
+) -> Any:
+    """Add arrows for a robot of this height [m]; the radius of the shafts is a share of it."""
+    size = {"shaft_radius": radius * height, "head_radius": 2.3 * radius * height}
+    points = np.zeros((1, 2, 3), np.float32)
+    return scene.add_arrows(name, points, colour, head_length=_HEAD * height, **size)
 
 
 def plot(gui: Any, title: str, x_name: str, x: np.ndarray, lines: Mapping[str, np.ndarray]) -> Any:
@@ -33,7 +62,27 @@ def series(x_name: str, names: Mapping[str, Any]) -> tuple[dict[str, Any], ...]:
     return ({"label": x_name}, *lines)
 
 
-def body_meshes(model: mujoco.MjModel, accent: tuple[int, int, int]) -> dict[int, Any]:
+class Bodies:
+    """The bodies of a robot in the scene."""
+
+    def __init__(
+        self, scene: Any, root: str, model: mujoco.MjModel, accent: tuple[int, int, int]
+    ) -> None:
+        """Add them below the frame `root`; see `_body_meshes`."""
+        self._model, self._data = model, mujoco.MjData(model)
+        meshes = _body_meshes(model, accent).items()
+        self._handles = {b: scene.add_mesh_trimesh(f"{root}/body{b}", mesh) for b, mesh in meshes}
+
+    def move(self, pose: Float[np.ndarray, " nq"]) -> None:
+        """Take a pose, MuJoCo's qpos."""
+        self._data.qpos[:] = pose
+        mujoco.mj_kinematics(self._model, self._data)
+        for body, handle in self._handles.items():
+            handle.position = self._data.xpos[body].copy()
+            handle.wxyz = self._data.xquat[body].copy()
+
+
+def _body_meshes(model: mujoco.MjModel, accent: tuple[int, int, int]) -> dict[int, Any]:
     """Make a mesh of the visible geoms of each body (geom groups 0 to 2).
 
     Args:
