@@ -207,7 +207,7 @@ def draw_page(path: Path, run: Path) -> None:
 
 def draw_live(path: Path) -> None:
     """Take a picture of the page of `hector view --live`, after six seconds of walking."""
-    with _live_page({"nominal": nominal(), "shipped": shipped()}, 960) as (tab, _):
+    with _live_page({"nominal": nominal(), "shipped": shipped()}, 1200) as (tab, _):
         Image.fromarray(tab.picture()).save(path, optimize=True)
 
 
@@ -222,13 +222,13 @@ def draw_live_film(path: Path) -> None:
         7.6: lambda tab: tab.click("from behind"),
     }
     frames: list[Image.Image] = []
-    with _live_page({"shipped": shipped()}, 720) as (tab, go):
+    with _live_page({"shipped": shipped()}, 1100) as (tab, go):
         for frame in range(round(10.0 / _FRAME)):
             for due in [due for due in acts if due <= frame * _FRAME]:
                 acts.pop(due)(tab)
                 time.sleep(1.0)  # until the page has told the server
             go(_FRAME)
-            frames.append(Image.fromarray(tab.picture()).resize((720, 432)))
+            frames.append(Image.fromarray(tab.picture()).reduce(2))
     options: dict[str, Any] = {
         "duration": round(1e3 * _FRAME),
         "loop": 0,

@@ -79,10 +79,10 @@ class LivePage:
         self._job: Future[Any] | None = None  # what is computed, of the last that was asked for
         self._at, self._drawn = dict(setup.at), {}  # values of `NUMBERS`, world and seed, if moved
         self._status = server.gui.add_markdown("")
-        self._add_walk()
         self._add_errors()
         self._weights = WeightsPanel(server.gui, self._when, setup, self._send, self._line)
         self._add_tuning()
+        self._add_walk()
         self._add_plant()
         self._build_world()
 
