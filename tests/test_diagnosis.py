@@ -138,12 +138,13 @@ def test_a_start_out_of_the_box_of_a_tuning_is_refused_before_it_walks(monkeypat
     high = nominal()
     high.Q.position[1] = 1e5
     save_weights(weak / "high.json", high)
-    for command in (("tune", "--traj", "straight"), ("propose", "folder", "--traj", "straight")):
+    for command in (("tune", "--traj", "straight"), ("propose", "runs", "--traj", "straight")):
         assert call(monkeypatch, *command, "--start", "high.json") == 2
         told = capsys.readouterr().err
         line = "--start high.json: Q_y is 100000; a tuning starts from weights of 0.01 to 10000"
         assert line in told
         assert "walking" not in told
+        assert not (weak / "runs").exists()
 
 
 def test_a_start_that_falls_late_is_told_and_tuned_from(monkeypatch, tmp_path, capsys):

@@ -152,6 +152,9 @@ def test_what_is_not_live_is_refused_in_a_line(monkeypatch, capsys, tmp_path):
     assert "--seconds is of a run" in line("--live", "--seconds", 2)
     assert "--at mass must be a number from 0.7 to 1.3, got '9'" in line("--live", "--at", "mass=9")
     assert "unknown number 'mas'; did you mean 'mass'?" in line("--live", "--at", "mas=1")
+    once = "--at takes NAME=VALUE, each name once, got mass"
+    assert f"{once}=1.2" in line("--live", "--at", "mass=1.1", "mass=1.2")
+    assert once in line("--live", "--at", "mass")
     assert "--at is of a live walk: --live" in line(tmp_path, "--at", "mass=1")
     assert "it tunes; got standin" in line("--live", "--world", "standin")
     own = EXAMPLES / "own_controller" / "numbers.toml"
@@ -225,6 +228,9 @@ def test_a_page_shows_what_the_walk_is_at_and_turns_undoes_and_saves_weights(mon
         page._ask(take_step)
         page.tune(found.log(0))
         assert page._found.content.startswith("Not yet: ")
+        errors = np.full(6, np.nan), np.ones(6)  # of a set that fell before its path, and another
+        page._note([found.walks[0].now()._replace(time=9.0, error=e) for e in errors])
+        np.testing.assert_allclose(page._strip[-1], [9.0, 0.0, np.sqrt(2), 0.0, np.sqrt(2)])
 
 
 def until(seconds, seen):

@@ -74,7 +74,9 @@ def _numbers(texts: Sequence[str]) -> dict[str, float]:
     """Read numbers of a live walk, NAME=VALUE each."""
     found = {}
     for text in texts:
-        name, _, value = text.partition("=")
+        name, sign, value = text.partition("=")
+        if not sign or name in found:
+            raise InputError(f"--at takes NAME=VALUE, each name once, got {text}")
         if name not in NUMBERS:
             raise InputError(f"--at {text}: {unknown('number', name, NUMBERS)}")
         _, low, high, _ = NUMBERS[name]

@@ -210,9 +210,10 @@ def _campaign(args: Propose) -> Campaign:
     trajectories = arguments.load_trajectories(args.traj, robot)
     config = best_set.on_walks(tunings.tune_config(robot, others=tunables(args.tune)))
     config = arguments.with_length(config, trajectories[0].seconds)
-    begun = (args.folder / CONFIG).exists()  # from weights that --start may no longer name
-    start = str(walks.weights_path(args.folder, 0)) if begun else args.start
-    start = arguments.weights_to_tune(start, robot, config)
+    if (args.folder / CONFIG).exists():  # begun with weights that --start may no longer name
+        start = arguments.weights_by_name(str(walks.weights_path(args.folder, 0)), robot)
+    else:
+        start = arguments.weights_to_tune(args.start, robot, config)
     commands = {trajectory.name: trajectory.command for trajectory in trajectories}
     planner = arguments.planner_of(args)
     if planner and config.others:

@@ -61,18 +61,19 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
     Raises:
         InputError: there is no such trajectory, their lengths differ, or --walks is too few for
             them; --walk-engine is not installed; --safe beside a position limit; --tune names
-            numbers that no gradient tunes; --net is not its net.
+            numbers that no gradient tunes; --start is out of their box; --net is not its net.
     """
     loaded = arguments.load_trajectories(args.traj, robot)
     _check_walker(args, robot)
-    start = arguments.weights_by_name(args.start, robot)
+    numbers = arguments.own_numbers(args, robot)
+    config = tunings.tune_config(robot, others=(*tunables(args.tune), *numbers))
+    start = arguments.weights_to_tune(args.start, robot, config)
     kept = len(kept_trajectories(args, robot, loaded))
-    along = len(along_of(start, arguments.own_numbers(args, robot), args.slopes == "walks"))
+    along = len(along_of(start, numbers, args.slopes == "walks"))
     best_set.walk_plants(robot, args.walk_plants, args.walks, len(loaded), along=along, kept=kept)
     if args.net:
         load_trained(args.net, robot, args.variant)
     arguments.engine_of(args)  # whether it is installed
-    tunings.tune_config(robot, others=tunables(args.tune))  # checks them before anything is tuned
     if args.safe and "position_limit" in start.others:
         raise InputError("--safe sets the position limit, which --start has already")
     return loaded

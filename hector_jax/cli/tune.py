@@ -126,7 +126,7 @@ def _begin(pool: Executor, folder: Path, args: Tune) -> _Run:
     trajectories = run_folder.trajectories(args, robot)
     config = tunings.tune_config(robot, iterations=args.iterations, others=tunables(args.tune))
     config = arguments.with_length(config, trajectories[0].seconds)
-    start = arguments.weights_to_tune(args.start, robot, config)
+    start = arguments.weights_by_name(args.start, robot)
     return _Run(Setup(pool, config, robot), folder, args, start, trajectories)
 
 

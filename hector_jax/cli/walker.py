@@ -292,7 +292,7 @@ def _campaign(
     """Return the settings of a tuning on the walks of a program."""
     kept = run_folder.kept_trajectories(args, robot, trajectories)
     groups, commands = args.slopes == "walks", len(trajectories)
-    start = arguments.weights_to_tune(args.start, robot, config)
+    start = arguments.weights_by_name(args.start, robot)
     along = len(along_of(start, config.others, groups))
     plants, _ = best_set.walk_plants(
         robot, args.walk_plants, args.walks, commands, along=along, kept=len(kept)

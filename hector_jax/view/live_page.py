@@ -251,13 +251,14 @@ class LivePage:
 
     def _note(self, walks: Sequence[Now]) -> None:
         """Add to the strip the time, and the errors in the plane and of roll and pitch together."""
-        off = np.reshape([now.error for now in walks], (-1, 2, 3))[..., :2]
-        row = max(now.time for now in walks), *np.linalg.norm(off, axis=2).T.ravel()
+        pairs = np.reshape([now.error for now in walks], (-1, 2, 3))[..., :2]
+        off = np.linalg.norm(pairs, axis=2).T.ravel()
+        # with a NaN the page draws no line at all: a set that fell before its path began has zero
+        row = max(now.time for now in walks), *np.nan_to_num(off)
         last = self._strip[-1][0] if self._strip else -np.inf
         if row[0] < last:
             self._strip.clear()  # after a reset
-        # before the path begins there is no error, and with a NaN the page draws no line at all
-        elif row[0] > last and np.isfinite(row).all():
+        elif row[0] > last and np.isfinite(off).any():  # before the path begins there is no error
             self._strip.append(row)
             while self._strip[0][0] < row[0] - _STRIP:
                 self._strip.popleft()
