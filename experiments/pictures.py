@@ -232,7 +232,7 @@ def draw_live_film(path: Path) -> None:
     options: dict[str, Any] = {
         "duration": round(1e3 * _FRAME),
         "loop": 0,
-        "quality": 40,
+        "quality": 30,
         "method": 6,
     }
     frames[0].save(path, save_all=True, append_images=frames[1:], **options)

@@ -120,9 +120,6 @@ INPUTS = {
     "hector log add runs/robot log.npz": [PROPOSED, PROPOSED_WALK.format("log.npz")],
     "hector log add runs/robot s.npz": [PROPOSED, PROPOSED_WALK.format("s.npz")],
     "hector export runs/c/TIME --set without": ["hector tune --traj c"],
-    "hector log check log.npz --robot mine.toml": [
-        "hector walk --walker mine.py --robot mine.toml --out log.npz"
-    ],
     "hector log check mine.npz --traj straight": [A_WALK.format("straight", "mine")],
     "hector log foretell mine.npz --walked nominal --weights expert shipped": [
         A_WALK.format("straight", "mine")
@@ -130,8 +127,9 @@ INPUTS = {
     "hector log foretell s.npz --traj s --walked nominal --weights shipped": [
         A_WALK.format("s", "s")
     ],
-    "hector evaluate --walker mine.py --robot mine.toml --traj c --weights mine.json best.json": [
-        "hector walk --walker mine.py --robot mine.toml --out log.npz"
+    "hector log twin log.npz --planner plans.py --robot mine/robot.toml --weights mine.json": [
+        "hector robot mine.xml --out mine",
+        "hector walk --walker mine.py --robot mine/robot.toml --weights mine.json --out log.npz",
     ],
 }
 """Lines whose input another page tells how to make, in words."""
@@ -173,6 +171,7 @@ def console(tmp_path_factory):
                 text = SHORT.format(f"{length}-{name}", seconds, speed)
                 Path(f"{length}/{name}.toml").write_text(text)
         Path("mine.py").symlink_to(own / "walker.py")
+        Path("mine.xml").symlink_to(ROOT / "assets" / "hector.xml")
         Path("plans.py").symlink_to(own / "planner.py")
         Path("hector.xml").symlink_to(own / "hector.xml")
         for name in ("mine", "twin"):
