@@ -552,6 +552,8 @@ def run():
     whole, tuning = map(round, result["minutes"])
     for page in (README, DOCS / "start.md"):
         yield page, f"{whole} minutes on two cores with set-up, then {tuning}"
+    size = result["gigabytes"]
+    yield DOCS / "start.md", f"{np.ceil(size):.0f} GB of disk"
     each = {name: rms(result["sets"][name])[:3] for name in ("best", "nominal", "expert")}
     text = "best is {:.1f} cm off, {:.1f} cm in height, {:.1f} degrees in pitch (RMS)"
     rest = ["{} {:.1f}, {:.1f}, {:.1f}".format(name, *each[name]) for name in [*each][1:]]
@@ -597,6 +599,8 @@ def laboratory():
     yield notes, text.format(*gains[1], *gains[2])
     least = min(-x["L [%]"]["mean"] for each in sets for x in each["commands"].values())
     yield notes, f"on no command by less than {least:.0f} %"
+    assert max(one["seconds"] for one in sets) < 600
+    yield README, "This took minutes for a laboratory's C++ controller."
     for command, page in (
         ("straight", notes),
         ("turn", notes),
@@ -679,6 +683,9 @@ def other_pages():
     carried = foretell.carry(pretend_verdict(8), "with")
     text = f"held {carried.held} of {carried.walks} walks of the other set"
     yield DOCS / "howto" / "walks.md", text
+    (many,) = report("performance/nvidia-h200.json")["sections"]["batch"]["rows"]
+    text = f"1024 tunings took {float(many[3]):.1f} s, after {many[6]} s of compiling"
+    yield DOCS / "howto" / "gpu.md", text
     notes, walks = ROOT / "experiments" / "notes.md", report("many-plants/walks.json")["L"]
     best_of_then, searched = (np.array([*walks[name].values()]) for name in ("best", "search"))
     lower = -100 * np.expm1(np.log(searched / best_of_then).mean(axis=1))

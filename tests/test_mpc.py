@@ -15,14 +15,8 @@ from oracles import exact_solution, pack_state
 from hector_jax.control import LINE_FOOT, InputConstraint, InputCost, Squares, StateConstraint
 from hector_jax.control.contact import FLAT_FOOT, FRICTION, LINE_FRICTION, Contact, Rows, StateCost
 from hector_jax.control.disturbance import NO_DISTURBANCE
-from hector_jax.control.mpc import (
-    Horizon,
-    MpcConfig,
-    MpcProblem,
-    build_qp,
-    solve_mpc,
-    solve_mpc_by_rows,
-)
+from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, build_qp, solve_mpc
+from hector_jax.control.mpc_by_rows import solve_mpc_by_rows
 from hector_jax.control.parameters import bounds
 from hector_jax.control.weights import Weights, expert, vector_to_weights, weights_to_vector
 from hector_jax.core.geometry import rot_z

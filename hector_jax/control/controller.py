@@ -263,7 +263,7 @@ def plan(
         last: wrench of the previous plan, which is kept between plans of several ticks; None: plan.
         desired: pose at the start of the reference of a log; None: by the rule of the twin.
         max_contacts: from `contacts_needed` (static).
-        solver: `solve_mpc` or `solve_mpc_by_rows`.
+        solver: `solve_mpc` or `mpc_by_rows.solve_mpc_by_rows`.
 
     Returns:
         The commanded wrench, the planned touchdowns, and the disturbance for the next plan.

@@ -22,7 +22,6 @@ from typing import Annotated, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jaxtyping import Bool, Float
 
 from hector_jax.control.contact import (
@@ -390,11 +389,7 @@ def build_qp(
 def solve_mpc(
     config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: int
 ) -> tuple[Wrench, Solution]:
-    """Solve the MPC; return the first step's wrench [N, N m], world frame, and the QP solution.
-
-    Args:
-        config, problem, dt, max_contacts: see `build_qp`.
-    """
+    """Solve the MPC of `build_qp`; return its first wrench [N, N m], world frame, and solution."""
     qp, condensed = build_qp(config, problem, dt=dt, max_contacts=max_contacts)
 
     def slope(x: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -403,43 +398,3 @@ def solve_mpc(
     first = condensed.inputs[0]
     solution = solve_qp(qp, config.qp, slope)
     return unpack_wrench(contract("ub,b->u", first, solution.x[: first.shape[1]])), solution
-
-
-solve_mpc_by_rows = jax.custom_jvp(solve_mpc, nondiff_argnums=(0, 2, 3))
-"""`solve_mpc` with another way to the derivative of its wrench, quick for many tangents at once.
-
-The wrenches of the feet that stand have fewer numbers than a tuning has weights. So the MPC is
-differentiated in reverse, once for each of them, and these rows multiply the tangents. The rest of
-the solution has no derivative.
-"""
-
-
-@partial(jax.jit, static_argnums=(0, 2, 3))  # a program that differentiates it often traces it once
-def _rows_of_wrench(
-    config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: int
-) -> tuple[tuple[Wrench, Solution], Array, MpcProblem]:
-    """Return `solve_mpc`, the feet of its contacts, and the derivative of their wrenches."""
-    solve = partial(solve_mpc, config, dt=dt, max_contacts=max_contacts)
-    wrench, pull_back, solution = jax.vjp(solve, problem, has_aux=True)
-    horizon = problem.horizon
-    inputs = horizon.contact if horizon.inputs is None else horizon.inputs
-    feet = feet_of_contacts(inputs[0].astype(wrench.force.dtype), max_contacts)
-    each = jnp.einsum("cf,ij->cifj", feet, jnp.eye(6, dtype=feet.dtype))
-    each = each.reshape(-1, *feet.shape[1:], 6)
-    (rows,) = jax.vmap(pull_back)(Wrench(each[..., :3], each[..., 3:]))
-    return (wrench, solution), feet, rows
-
-
-@partial(solve_mpc_by_rows.defjvp, symbolic_zeros=True)
-def _jvp_by_rows(
-    config: MpcConfig, dt: float, max_contacts: int, primals: tuple, tangents: tuple
-) -> tuple:
-    found, feet, rows = _rows_of_wrench(config, *primals, dt, max_contacts)
-    changes = [
-        jnp.tensordot(row, change, jnp.ndim(change))
-        for row, change in zip(*map(jax.tree.leaves, (rows, *tangents)), strict=True)
-        if not isinstance(change, SymbolicZero)
-    ]
-    moved = feet.T @ sum(changes).reshape(-1, 6)
-    still = jax.tree.map(zero_from_primal, found[1])
-    return found, (Wrench(moved[:, :3], moved[:, 3:]), still)

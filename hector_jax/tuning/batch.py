@@ -126,7 +126,7 @@ def _evaluate(
     problem: BatchProblem,
     state: TuneState,
 ) -> tuple[Evaluation, Float[Array, "n n"]]:
-    """Evaluate all scenarios of a problem as one; also return the matrix, zero without a need."""
+    """Evaluate all scenarios of a problem as one; the matrix is zero if the rule takes none."""
     config, lanes, walk, _ = program
     single = all(len(leaf) == 1 for leaf in jax.tree.leaves(effects))
     weights = difftune.trial_weights(config, state)
@@ -134,11 +134,12 @@ def _evaluate(
     def slope(of: BatchScenario) -> tuple[Evaluation, Array]:
         effect = jax.tree.map(lambda leaf: leaf[0 if single else of.effect], effects)
         scenario = Scenario(robot, of.command, of.anchor, effect, of.variation)
-        shared = config.rollout, scenario, weights, of.loss
         if config.rule == "gauss_newton":
-            found, matrix = least_squares(*shared, walk=walk, others=config.others)
+            options = {"walk": walk, "others": config.others}
+            found, matrix = least_squares(config.rollout, scenario, weights, of.loss, **options)
         else:
-            found, matrix = evaluate(*shared, walk=walk), jnp.zeros_like(state.rule.matrix)
+            found = evaluate(config.rollout, scenario, weights, of.loss, walk=walk)
+            matrix = jnp.zeros_like(state.rule.matrix)
         loss, terms, gradient, matrix = jax.tree.map(lambda x: x / of.scale, (*found[:3], matrix))
         return found._replace(loss=loss, terms=terms, gradient=gradient), matrix
 

@@ -87,8 +87,10 @@ def _slope(
     scenario = Scenario(robot, with_pieces(walked.command), walked.anchor, effect)
     fit = partial(fit_grounding, config.rollout, scenario, walked.weights, walk)
     grounding = fit(np.int32(walked.start_tick), anchor=walked.anchor)
-    at = config.rollout, grounding, difftune.trial_weights(config, state), config.loss
-    slope = least_squares_jit(*at, walk=grounded_rollout)
+    weights = difftune.trial_weights(config, state)
+    slope = least_squares_jit(
+        config.rollout, grounding, weights, config.loss, walk=grounded_rollout
+    )
     return config, state, grounding, jax.device_get(slope)
 
 

@@ -26,7 +26,8 @@ from hector_jax.control.controller import (
 )
 from hector_jax.control.disturbance import NO_DISTURBANCE
 from hector_jax.control.footstep import Feet, feet_where
-from hector_jax.control.mpc import solve_mpc, solve_mpc_by_rows
+from hector_jax.control.mpc import solve_mpc
+from hector_jax.control.mpc_by_rows import solve_mpc_by_rows
 from hector_jax.control.reference import Anchor, Command, anchor_at, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
@@ -57,7 +58,7 @@ class RolloutConfig:
     block: int = 500  # most ticks with stored solves; longer rollouts are computed twice
     estimate_noise: float = 0.0  # factor on the noise of a real robot's estimate
     delay: float = 0.0  # [s] of the ground's reaction, at most a tick
-    forward: bool = False  # many derivatives in forward mode are quick, those in reverse slow
+    forward: bool = False  # for derivatives by many numbers in forward mode, see `mpc_by_rows`
 
     def __post_init__(self) -> None:
         not_negative = dict.fromkeys(("lead", "estimate_noise"), NOT_NEGATIVE)

@@ -77,8 +77,8 @@ class WeightsPanel:
             when(take, lambda name: self.set(self.chosen, setup.named[name]))
             when(gui.add_button("Undo"), lambda _: self._undo())
             names = np.reshape(direction_names(self._past[0][0]), (-1, 3)).tolist()
-            for group, members in zip(_GROUPS.items(), names, strict=False):
-                self._add_group(gui, when, *group, members)
+            for (title, unit), members in zip(_GROUPS.items(), names, strict=False):
+                self._add_group(gui, when, title, unit, members)
             self._file = gui.add_text("file", "live.json")
             when(gui.add_button("Save these weights"), lambda _: self._save())
             self._line = gui.add_markdown("")
